@@ -1,0 +1,251 @@
+"""The commands: thin, and quick to start. What they need is imported when they run."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+from cyclopts.validators import Number
+
+from swarmsim.config.errors import InputError
+
+EXIT_INPUT, EXIT_INTERRUPTED = 2, 130
+SEED_END = 2**31
+
+Kind = Literal["vehicles", "sites", "missions", "detectors", "nuclides", "materials", "policies"]
+ModelKind = Literal["mission", "vehicle", "site", "detector", "nuclide", "material"]
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return f"swarmsim {version('swarmsim')}"
+    except PackageNotFoundError:
+        return "swarmsim, run from its source folder without being installed"
+
+
+app = App(
+    name="swarmsim",
+    help=(
+        "Simulate teams of aerial and ground robots that search for radioactive sources.\n\n"
+        "Examples:\n"
+        "    swarmsim run recon               fly the shipped mission, results in runs/recon\n"
+        "    swarmsim view runs/recon         watch it in the Rerun viewer\n"
+        "    swarmsim init my_project         copy the configurations out, to edit them\n"
+        "    swarmsim list vehicles           what there is to build a team of\n\n"
+        "Exit codes: 0 done, 2 wrong input (said on standard error), 130 stopped with Ctrl-C."
+    ),
+    version=_version,
+    help_format="plaintext",
+    suppress_keyboard_interrupt=False,
+)
+
+
+@app.command
+def run(
+    scenario: str,
+    *,
+    out: Path | None = None,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END))] = None,
+    missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1_000_000))] = 1,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False, negative="")] = (),
+    force: Annotated[bool, Parameter(negative="")] = False,
+) -> None:
+    """Fly a mission, or many at once, and write the results.
+
+    Examples:
+        swarmsim run recon
+        swarmsim run configs/missions/recon.yaml --seed 7 --out runs/seven
+        swarmsim run recon --missions 256
+        swarmsim run recon --set aerial.altitude_m=30 --set sources.0.activity_mbq=50
+        swarmsim run runs/recon/scenario.yaml --out runs/again
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission (see 'swarmsim list missions') or path of a mission file.
+    out
+        Folder of the results; runs/NAME by default. It must not exist, unless --force is given.
+    seed
+        Seed of the (first) mission, instead of the one in the file.
+    missions
+        How many missions to fly in one batch, with seeds N, N+1, …
+    overrides
+        Change a value of the mission, as path=value; may be given again and again. Items of a list are named by
+        index or by their name, e.g. vehicles.uav1.heading_deg=90.
+    force
+        Replace the results of an earlier run.
+    """
+    from swarmsim.cli_run import run_scenario
+
+    run_scenario(scenario, out, seed, missions, overrides, force)
+
+
+@app.command
+def view(run: Path, *, web: Annotated[bool, Parameter(negative="")] = False) -> None:
+    """Open the recording of a run in the Rerun viewer.
+
+    Examples:
+        swarmsim view runs/recon
+        swarmsim view runs/recon --web
+
+    Parameters
+    ----------
+    run
+        Folder of a run, or an .rrd file.
+    web
+        Use the viewer in the browser instead of the desktop's.
+    """
+    from swarmsim.cli_run import view_run
+
+    view_run(run, web)
+
+
+@app.command
+def check(*paths: Path) -> None:
+    """Validate configuration files of any kind, and tell everything that is wrong with them.
+
+    Examples:
+        swarmsim check configs/missions/recon.yaml
+        swarmsim check my_vehicle.yaml configs/nuclides/*.yaml
+        swarmsim check configs
+
+    Parameters
+    ----------
+    paths
+        Files, or folders whose YAML files are all checked. What a file describes is told from its folder
+        (missions, vehicles, sites …) or from its fields.
+    """
+    from swarmsim.cli_files import check_files
+
+    check_files(paths)
+
+
+@app.command
+def schema(kind: ModelKind = "mission") -> None:
+    """Print the JSON schema of a kind of configuration file, e.g. for an editor's completion.
+
+    Examples:
+        swarmsim schema
+        swarmsim schema vehicle > vehicle.schema.json
+
+    Parameters
+    ----------
+    kind
+        Which configuration file.
+    """
+    from swarmsim.cli_files import print_schema
+
+    print_schema(kind)
+
+
+@app.command(name="list")
+def list_(kind: Kind | None = None) -> None:
+    """List what is available: vehicles, sites, missions, detectors, nuclides, materials and policies.
+
+    Examples:
+        swarmsim list
+        swarmsim list nuclides
+
+    Parameters
+    ----------
+    kind
+        List this kind only.
+    """
+    from swarmsim.cli_files import list_available
+
+    list_available(kind)
+
+
+@app.command
+def init(folder: Path) -> None:
+    """Copy the shipped configurations to FOLDER/configs, to be edited; names found there come before the shipped ones.
+
+    Examples:
+        swarmsim init .
+        swarmsim init my_project && cd my_project && swarmsim run recon
+
+    Parameters
+    ----------
+    folder
+        Where to put 'configs'; made if needed. An existing 'configs' is never overwritten.
+    """
+    from swarmsim.cli_files import copy_configurations
+
+    copy_configurations(folder)
+
+
+@app.command
+def import_site(
+    file: Path,
+    *,
+    out: Path,
+    name: str | None = None,
+    unit: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
+    up: Literal["X", "Y", "Z"] | None = None,
+    cell: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
+    ground: Annotated[tuple[str, ...], Parameter(consume_multiple=False, negative="")] = (),
+    force: Annotated[bool, Parameter(negative="")] = False,
+) -> None:
+    """Turn a mesh (.dae, .obj, .glb, .stl) or an elevation model (GeoTIFF) into a site.
+
+    Examples:
+        swarmsim import-site farm.dae --out configs/sites/farm
+        swarmsim import-site yard.obj --out configs/sites/yard --unit 0.01 --up Y --ground 'terrain*'
+        swarmsim import-site alps.tif --out configs/sites/alps --cell 2
+
+    Parameters
+    ----------
+    file
+        The mesh or the elevation model.
+    out
+        Folder of the new site; its name is the site's name unless --name is given.
+    name
+        Name of the site.
+    unit
+        Metres of one unit of the file, where the file does not say or is wrong.
+    up
+        The axis of the file that points up, where the file does not say or is wrong.
+    cell
+        Size of the cells of the height maps, in metres.
+    ground
+        Pattern of the materials or geometries that are bare ground; may be given again and again.
+    force
+        Replace an existing site.
+    """
+    from swarmsim.cli_files import import_site_file
+
+    import_site_file(file, out, name, unit, up, cell, ground, force)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line ``arguments`` (those of the process when None); the exit code.
+
+    Wrong input is told on standard error without a traceback; an error of swarmsim itself keeps its traceback.
+    """
+    try:
+        app(
+            sys.argv[1:] if arguments is None else list(arguments),
+            exit_on_error=False,
+            print_error=False,
+            result_action="return_none",
+        )
+    except CycloptsError as error:
+        sys.stderr.write(f"{error}\n\nSee 'swarmsim --help' and 'swarmsim COMMAND --help'.\n")
+        return EXIT_INPUT
+    except InputError as error:
+        sys.stderr.write(f"{describe(error)}\n")
+        return EXIT_INPUT
+    except KeyboardInterrupt:
+        sys.stderr.write("\nstopped with Ctrl-C: nothing unfinished was left behind\n")
+        return EXIT_INTERRUPTED
+    return 0
+
+
+def describe(error: InputError) -> str:
+    """All problems of an `InputError` as text."""
+    count = len(error.problems)
+    heading = "" if count == 1 else f"{count} problems\n\n"
+    return heading + "\n\n".join(str(problem) for problem in error.problems)

@@ -1,0 +1,1 @@
+"""Scenario models: validated, immutable, with units in the field names; YAML in, clear errors out."""

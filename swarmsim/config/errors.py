@@ -1,0 +1,62 @@
+"""Input errors: everything that is wrong with what a user gave, gathered and said at once."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong, where it stands and how to mend it.
+
+    ``file`` is the path of the file (or ``--set`` for an override), ``line`` counts from 1, ``path`` is the dotted place
+    of the value inside the file, ``given`` is what stands there, ``allowed`` says what may stand there, and
+    ``suggestion`` is the nearest valid name or a hint.
+    """
+
+    message: str
+    file: str | None = None
+    line: int | None = None
+    path: str | None = None
+    given: str | None = None
+    allowed: str | None = None
+    suggestion: str | None = None
+
+    @property
+    def where(self) -> str:
+        """Place of the problem, ``file:line path``; empty when it has none."""
+        place = "" if self.file is None else self.file if self.line is None else f"{self.file}:{self.line}"
+        return " ".join(part for part in (place, self.path) if part)
+
+    def __str__(self) -> str:
+        """A readable block: place and message on the first line, the rest indented below it."""
+        lines = [f"{self.where}: {self.message}" if self.where else self.message]
+        for label, value in (("given", self.given), ("allowed", self.allowed), ("hint", self.suggestion)):
+            if value is not None:
+                lines.append(f"    {label + ':':<9}{value}")
+        return "\n".join(lines)
+
+
+class InputError(Exception):
+    """What a user gave cannot be used. ``problems`` holds every reason; the command line prints them and exits with 2."""
+
+    def __init__(self, problems: Iterable[Problem]):
+        """Hold ``problems`` (at least one)."""
+        self.problems: tuple[Problem, ...] = tuple(problems)
+        if not self.problems:
+            raise ValueError("an InputError needs at least one problem")
+        super().__init__("\n".join(map(str, self.problems)))
+
+    @classmethod
+    def of(cls, sentence: str, **where: Any) -> "InputError":
+        """An error with a single problem; ``where`` are the other fields of `Problem`."""
+        if isinstance(where.get("file"), Path):
+            where["file"] = str(where["file"])
+        return cls([Problem(message=sentence, **where)])
+
+
+def raise_if_any(problems: Sequence[Problem]) -> None:
+    """Raise one `InputError` with all ``problems``, or nothing when there are none."""
+    if problems:
+        raise InputError(problems)

@@ -1,0 +1,76 @@
+"""Where configuration files are: the working folder's ``configs`` first, then those that the package carries."""
+
+from pathlib import Path
+
+from swarmsim.config.errors import InputError
+from swarmsim.config.names import did_you_mean, one_of
+
+KINDS = ("vehicles", "sites", "missions", "detectors", "nuclides", "materials")
+_SUFFIXES = (".yaml", ".yml")
+
+
+def packaged_dir() -> Path:
+    """The configurations that the package carries: inside an installed package, beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "_configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def config_dirs(near: Path | None = None) -> list[Path]:
+    """Folders that are searched, first come first served.
+
+    They are the ``configs`` folder that the file ``near`` lies in (the parent of its ``missions``, ``vehicles`` …), the
+    ``configs`` of the working folder, and the packaged ones.
+    """
+    found: list[Path] = []
+    if near is not None:
+        parents = near.absolute().parents
+        found += [parents[i + 1] for i in range(min(2, len(parents) - 1)) if parents[i].name in KINDS]
+    found += [folder for folder in (Path.cwd() / "configs", packaged_dir()) if folder.is_dir()]
+    unique: dict[Path, Path] = {}
+    for folder in found:
+        unique.setdefault(folder.resolve(), folder)
+    return list(unique.values())
+
+
+def available(kind: str, near: Path | None = None) -> dict[str, Path]:
+    """Names of a kind (one of `KINDS`) and their files, sorted by name; an earlier folder hides a later one."""
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {KINDS}, not {kind!r}")
+    found: dict[str, Path] = {}
+    for folder in config_dirs(near):
+        if kind == "sites":
+            named = [(path.parent.name, path) for path in (folder / kind).glob("*/site.yaml")]
+        else:
+            named = [(path.stem, path) for path in (folder / kind).glob("*") if path.suffix in _SUFFIXES]
+        for name, path in named:
+            found.setdefault(name, path)
+    return dict(sorted(found.items()))
+
+
+def looks_like_path(name: str) -> bool:
+    """Whether ``name`` is meant as a path (it has a folder or a YAML suffix) rather than as a configuration's name."""
+    return "/" in name or "\\" in name or Path(name).suffix in _SUFFIXES
+
+
+def find(kind: str, name: str | Path, near: Path | None = None) -> Path:
+    """The file of configuration ``name`` of a kind; a path to a file works too (a folder with ``site.yaml`` for sites).
+
+    Raises `InputError` with the nearest names when there is none.
+    """
+    path = Path(name)
+    if isinstance(name, Path) or looks_like_path(name):
+        if kind == "sites" and (path / "site.yaml").is_file():
+            return path / "site.yaml"
+        if path.exists():
+            return path
+    known = available(kind, near)
+    if str(name) in known:
+        return known[str(name)]
+    beside = sorted(str(path.with_name(p.name)) for p in path.parent.glob("*") if p.suffix in _SUFFIXES)
+    raise InputError.of(
+        f"there is no {'file' if looks_like_path(str(name)) else kind.removesuffix('s')} '{name}'",
+        given=str(name),
+        allowed=f"{one_of(known)}; or the path of a file",
+        suggestion=did_you_mean(str(name), beside) if looks_like_path(str(name)) else did_you_mean(str(name), known),
+    )

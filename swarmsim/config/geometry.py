@@ -1,0 +1,157 @@
+"""Checks of a scenario against the ground of its site: what stands outside, inside a wall, or has no room."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmsim.config.checks import footprint_radius_m
+from swarmsim.config.documents import Place
+from swarmsim.config.errors import Problem
+from swarmsim.config.scenario import Scenario
+from swarmsim.config.vehicles import SkidSteer
+
+if TYPE_CHECKING:
+    from swarmsim.site import Site, SiteModel
+
+Floats = NDArray[np.float64]
+
+POROUS_KG_M3 = 100.0  # a thing of a lower bulk density is foliage or straw: a source can lie in it
+
+
+def check_geometry(scenario: Scenario, model: SiteModel | None = None) -> list[Problem]:
+    """What of the scenario does not fit its site; ``model`` is the loaded site, where the caller has it already.
+
+    Raises `InputError` when the site itself cannot be loaded.
+    """
+    if model is None:
+        from swarmsim.site import load_site
+
+        model = load_site(scenario.site_file, tuple(scenario.materials))
+    ground = _Ground(model.site, scenario)
+    return [*_check_sources(scenario, ground), *_check_vehicles(scenario, ground), *_check_area(scenario, ground)]
+
+
+class _Ground:
+    """The site's arrays on the host."""
+
+    def __init__(self, site: Site, scenario: Scenario):
+        self.cell = float(site.cell_m)
+        self.terrain = np.asarray(site.terrain_m, float)
+        self.clearance = np.asarray(site.clearance_m, float)
+        self.low = np.asarray(site.origin_m, float) - self.cell / 2
+        self.high = self.low + self.cell * np.array(self.terrain.shape[::-1])
+        self.area = np.asarray(site.survey_area_m, float)
+        boxes = site.obstacles
+        self.centre = np.asarray(boxes.centre_m, float)
+        self.half = np.asarray(boxes.half_extent_m, float)
+        self.axis = np.asarray(boxes.axis, float)
+        self.wall = np.asarray(boxes.wall_m, float)
+        self.material = [site.material_names[int(i)] for i in np.asarray(boxes.material)]
+        self.porous = np.array([scenario.materials[name].density_kg_m3 < POROUS_KG_M3 for name in self.material])
+
+    @property
+    def extent(self) -> str:
+        """What positions are allowed, in words."""
+        (west, south), (east, north) = self.low, self.high
+        return f"x from {west:g} to {east:g}, y from {south:g} to {north:g}"
+
+    def holds(self, xy: Floats) -> bool:
+        """Whether ``xy`` [2] lies on the site."""
+        return bool(np.all(xy >= self.low) and np.all(xy <= self.high))
+
+    def cell_value(self, raster: Floats, xy: Floats) -> float:
+        """Value of the cell that ``xy`` [2] lies in."""
+        rows, columns = raster.shape
+        column, row = np.clip(((xy - self.low) / self.cell).astype(int), 0, [columns - 1, rows - 1])
+        return float(raster[row, column])
+
+    def inside(self, points: Floats) -> NDArray[np.bool_]:
+        """Which boxes hold the point [3], as distances within their faces; [K, 3] each box's own axes."""
+        offset = points - self.centre
+        along = offset[:, 0] * self.axis[:, 0] + offset[:, 1] * self.axis[:, 1]
+        across = -offset[:, 0] * self.axis[:, 1] + offset[:, 1] * self.axis[:, 0]
+        depth: Floats = self.half - np.abs(np.stack([along, across, offset[:, 2]], axis=1))
+        return depth
+
+
+def _check_sources(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
+    for i, source in enumerate(scenario.mission.sources):
+        place: Place = ("sources", i, "position_m")
+        xy, given = np.array(source.position_m), str(list(source.position_m))
+        if not ground.holds(xy):
+            yield scenario.problem(place, "the source lies outside the site", given=given, allowed=ground.extent)
+            continue
+        depth = ground.inside(np.array([*xy, ground.cell_value(ground.terrain, xy) + source.height_m]))
+        within = np.all(depth > 0, axis=1)
+        in_cavity = (ground.wall > 0) & np.all(depth >= ground.wall[:, None], axis=1)
+        blocked = np.flatnonzero(within & ~in_cavity & ~ground.porous)
+        if blocked.size:
+            k = int(blocked[0])
+            what = "the wall of a building" if ground.wall[k] > 0 else "a solid obstacle"
+            yield scenario.problem(
+                place,
+                f"the source lies inside {what} of {ground.material[k]}",
+                given=f"{given}, height_m {source.height_m:g}",
+                allowed="the open, or the hollow inside of a building",
+                suggestion=f"the obstacle's centre is at {_point(ground.centre[k, :2])}; move the source by the wall's "
+                "thickness or more",
+            )
+
+
+def _check_vehicles(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
+    for i, (member, vehicle) in enumerate(zip(scenario.mission.vehicles, scenario.vehicles, strict=True)):
+        place: Place = ("vehicles", i, "position_m")
+        xy, given = np.array(member.position_m), str(list(member.position_m))
+        radius = footprint_radius_m(vehicle)
+        if not ground.holds(xy):
+            message = f"'{member.name}' starts outside the site"
+            yield scenario.problem(place, message, given=given, allowed=ground.extent)
+            continue
+        height = vehicle.chassis_height_m if isinstance(vehicle, SkidSteer) else vehicle.collision_height_m
+        depth = ground.inside(np.array([*xy, ground.cell_value(ground.terrain, xy) + height / 2]))
+        touching = np.flatnonzero((depth[:, :2].min(axis=1) > -radius) & (depth[:, 2] > -height / 2))
+        touching = touching[np.all(ground.half[touching] > 0, axis=1)]
+        if touching.size:
+            k = int(touching[0])
+            yield scenario.problem(
+                place,
+                f"'{member.name}' starts inside an obstacle of {ground.material[k]}, or touches it",
+                given=given,
+                allowed=f"at least {radius:.2f} m from every obstacle",
+                suggestion=f"the obstacle's centre is at {_point(ground.centre[k, :2])}",
+            )
+        elif isinstance(vehicle, SkidSteer) and ground.cell_value(ground.clearance, xy) <= 0:
+            message = f"'{member.name}' starts where a rover cannot drive (an obstacle, a closed zone or the site's edge)"
+            yield scenario.problem(place, message, given=given, allowed="traversable ground")
+
+
+def _check_area(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
+    aerial = scenario.mission.aerial
+    place: Place = ("aerial", "area_m") if aerial.area_m is not None else ("site",)
+    corners = ground.area if aerial.area_m is None else np.array(aerial.area_m)
+    outside = [_point(corner) for corner in corners if not ground.holds(corner)]
+    if outside:
+        yield scenario.problem(
+            place, "the survey area reaches beyond the site", given=", ".join(outside), allowed=ground.extent
+        )
+    spacing = aerial.line_spacing_m or aerial.altitude_m / 2
+    angle = math.radians(aerial.sweep_deg)
+    along = np.ptp(corners @ np.array([math.cos(angle), math.sin(angle)]))
+    across = np.ptp(corners @ np.array([-math.sin(angle), math.cos(angle)]))
+    if min(along, across) < spacing:
+        yield scenario.problem(
+            place,
+            "the survey area has no room for one survey line",
+            given=f"{along:.4g} m along the lines and {across:.4g} m across them",
+            allowed=f"at least the line spacing, {spacing:g} m, both ways",
+            suggestion="enlarge aerial.area_m, or set a smaller aerial.line_spacing_m",
+        )
+
+
+def _point(xy: Floats) -> str:
+    return f"[{xy[0]:.4g}, {xy[1]:.4g}]"

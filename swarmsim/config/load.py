@@ -1,0 +1,132 @@
+"""YAML files to validated models: composition with ``extends``, overrides, and one error that says all."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from swarmsim.config import files
+from swarmsim.config.allowed import shape_of
+from swarmsim.config.catalogue import MODELS, kind_of_model
+from swarmsim.config.documents import Document, read_file
+from swarmsim.config.errors import InputError
+from swarmsim.config.names import did_you_mean
+from swarmsim.config.overrides import apply_overrides
+from swarmsim.config.validation import validate
+
+
+def load_model(path: str | Path, cls: Any) -> Any:
+    """The validated model ``cls`` of the YAML file ``path``; raises `InputError` with every problem of the file.
+
+    ``cls`` is a model or a union of models (`swarmsim.config.vehicles.Vehicle`).
+    """
+    return validate(read_document(Path(path), kind_of_model(cls)), cls)
+
+
+def load_named(kind: str, name: str | Path, near: Path | None = None) -> Any:
+    """The validated configuration ``name`` (or the file) of a kind of `swarmsim.config.files.KINDS`.
+
+    Every kind but a mission must carry the name of its file (of its folder for a site). A vehicle's body file is
+    found beside the vehicle's file.
+    """
+    path = files.find(kind, name, near)
+    document = read_document(path, kind)
+    model = validate(document, MODELS[kind])
+    known_as = path.parent.name if kind == "sites" and path.name == "site.yaml" else path.stem
+    if kind != "missions" and model.name != known_as:
+        problem = document.problem(
+            ("name",),
+            f"the name inside differs from the {'folder' if kind == 'sites' else 'file'}'s",
+            given=model.name,
+            allowed=known_as,
+            suggestion=f"write 'name: {known_as}', or rename the file",
+        )
+        raise InputError([problem])
+    return _with_body(model, path, document) if kind == "vehicles" else model
+
+
+def _with_body(vehicle: Any, path: Path, document: Document) -> Any:
+    """The vehicle with its body's file, written relative to the folder of the vehicle's file, made absolute."""
+    if vehicle.body is None:
+        return vehicle
+    file = path.parent.resolve() / vehicle.body.file
+    if not file.is_file():
+        place = ("body", "file")
+        raise InputError([document.problem(place, "there is no such file", given=vehicle.body.file)])
+    return vehicle.model_copy(update={"body": vehicle.body.model_copy(update={"file": str(file)})})
+
+
+def load_all(kind: str, near: Path | None = None) -> dict[str, Any]:
+    """Every configuration of a kind by its name, in the order of the names; raises with the problems of all of them."""
+    models: dict[str, Any] = {}
+    problems = []
+    for name, path in files.available(kind, near).items():
+        try:
+            models[name] = load_named(kind, path, near)
+        except InputError as error:
+            problems += error.problems
+    if problems:
+        raise InputError(problems)
+    return models
+
+
+def read_document(path: Path, kind: str | None = None, overrides: Sequence[str] = ()) -> Document:
+    """The plain data of a file with what it extends merged in and the ``path=value`` overrides applied."""
+    document = _extended(path, kind, ())
+    if overrides and kind is not None:
+        apply_overrides(document, overrides, shape_of(MODELS[kind]))
+    return document
+
+
+def _extended(path: Path, kind: str | None, chain: tuple[Path, ...]) -> Document:
+    document = read_file(path)
+    if kind is None or "extends" not in document.data:
+        return document
+    place = ("extends",)
+    parent = document.data["extends"]
+    if not isinstance(parent, str):
+        allowed = f"the name of one of the {kind}, or the path of a file"
+        raise InputError([document.problem(place, "is not a name", given=str(parent), allowed=allowed)])
+    chain = (*chain, path.resolve())
+    parent_path = _parent_path(document, kind, parent, path)
+    if parent_path.resolve() in chain:
+        loop = " -> ".join(p.stem for p in (*chain, parent_path))
+        raise InputError([document.problem(place, f"extends itself: {loop}", given=parent)])
+    base = _extended(parent_path, kind, chain)
+    merged = Document(base.data, base.marks, (path, *base.files))
+    merged.marks[()] = document.marks[()]
+    document.data.pop("extends")
+    _merge(merged, document, merged.data, document.data, ())
+    return merged
+
+
+def _parent_path(document: Document, kind: str, parent: str, path: Path) -> Path:
+    if files.looks_like_path(parent):
+        beside = path.parent / parent
+        if beside.is_file():
+            return beside
+    known = files.available(kind, path)
+    own = {name: p for name, p in known.items() if p.resolve() != path.resolve()}
+    if parent in own:
+        return own[parent]
+    if parent in known or parent == path.stem:
+        raise InputError([document.problem(("extends",), f"extends itself: {parent}", given=parent)])
+    problem = document.problem(
+        ("extends",),
+        f"there is no {kind.removesuffix('s')} '{parent}' to extend",
+        given=parent,
+        allowed=", ".join(own) or "nothing: there are none",
+        suggestion=did_you_mean(parent, own),
+    )
+    raise InputError([problem])
+
+
+def _merge(into: Document, source: Document, old: dict[str, Any], new: dict[str, Any], place: tuple[str, ...]) -> None:
+    """Merge mappings deeply; lists and single values replace those below them."""
+    for key, value in new.items():
+        here = (*place, key)
+        if isinstance(value, dict) and isinstance(old.get(key), dict):
+            into.marks[here] = source.marks[here]
+            _merge(into, source, old[key], value, here)
+        else:
+            old[key] = value
+            into.replace(here, {p: m for p, m in source.marks.items() if p[: len(here)] == here})

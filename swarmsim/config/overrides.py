@@ -1,0 +1,80 @@
+"""Dotted overrides from the command line: ``aerial.altitude_m=30``, ``sources.0.activity_mbq=50``."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from swarmsim.config.allowed import Shape
+from swarmsim.config.documents import Document, Mark, Place, dotted, parse_value
+from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.names import did_you_mean, one_of
+
+ORIGIN = "--set"
+
+
+def apply_overrides(document: Document, overrides: Sequence[str], shape: Shape) -> None:
+    """Set each ``path=value`` in the document; raises one `InputError` with everything that is wrong with them.
+
+    A list's items are named by index, or by their ``name`` field (``vehicles.uav1.heading_deg=90``); values are YAML.
+    """
+    problems: list[Problem] = []
+    for text in overrides:
+        try:
+            _apply(document, text, shape)
+        except InputError as error:
+            problems += error.problems
+    if problems:
+        raise InputError(problems)
+
+
+def _apply(document: Document, text: str, shape: Shape) -> None:
+    path, equals, value_text = text.partition("=")
+    steps = path.strip().split(".")
+    if not equals or not all(steps):
+        raise InputError.of(
+            "is not of the form path=value", file=ORIGIN, given=text, suggestion=f"e.g. {ORIGIN} aerial.altitude_m=30"
+        )
+    try:
+        value = parse_value(value_text)
+    except InputError as error:
+        raise InputError([_at(tuple(steps), p.message, given=value_text) for p in error.problems]) from None
+    place: Place = ()
+    node: Any = document.data
+    for i, step in enumerate(steps):
+        known = _known_step(node, step, place, document, shape)
+        place = (*place, known)
+        if i == len(steps) - 1:
+            node[known] = value
+        elif isinstance(node, list) or isinstance(node.get(known), dict | list):
+            node = node[known]
+        else:
+            node[known] = {}
+            node = node[known]
+    document.replace(place, {place: Mark(ORIGIN, None)})
+
+
+def _known_step(node: Any, step: str, place: Place, document: Document, shape: Shape) -> str | int:
+    """The key or index that ``step`` means in ``node``; raises with the nearest when there is none."""
+    here = dotted(place) or "the top level"
+    if isinstance(node, list):
+        if step.isdigit() and int(step) < len(node):
+            return int(step)
+        names = [item["name"] for item in node if isinstance(item, dict) and isinstance(item.get("name"), str)]
+        if step in names:
+            return names.index(step)
+        allowed = f"an index from 0 to {len(node) - 1}" if node else "nothing: the list is empty; set the whole list"
+        allowed += f", or {one_of(names)}" if names else ""
+        raise InputError(
+            [_at((*place, step), f"{here} has no item '{step}'", allowed=allowed, suggestion=did_you_mean(step, names))]
+        )
+    if isinstance(node, dict):
+        inner = shape.at((*place, step), document.data)
+        if inner is not None:
+            return step
+        fields = shape.fields(place, document.data)
+        message, hint = f"{here} has no field '{step}'", did_you_mean(step, fields)
+        raise InputError([_at((*place, step), message, allowed=one_of(fields), suggestion=hint)])
+    raise InputError([_at((*place, step), f"{here} is a single value and has nothing inside")])
+
+
+def _at(place: Place, message: str, **details: str | None) -> Problem:
+    return Problem(message=message, file=ORIGIN, path=dotted(place), **details)

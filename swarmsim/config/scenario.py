@@ -1,0 +1,184 @@
+"""A scenario: a mission with everything that it names looked up, checked and held together."""
+
+import hashlib
+import importlib.metadata
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from swarmsim.config import files
+from swarmsim.config.allowed import item, shape_of
+from swarmsim.config.checks import check_consistency, check_detectors, check_references, known_names
+from swarmsim.config.documents import Document, Place, dump_yaml
+from swarmsim.config.errors import InputError, Problem, raise_if_any
+from swarmsim.config.load import load_named, read_document
+from swarmsim.config.mission import Mission
+from swarmsim.config.overrides import apply_overrides
+from swarmsim.config.radiation import Detector, Material, Nuclide
+from swarmsim.config.site import SiteSpec
+from swarmsim.config.validation import validate
+from swarmsim.config.vehicles import Multirotor, SkidSteer
+
+_VERSIONED = ("swarmsim", "jax", "mujoco", "mujoco-mjx", "numpy")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A mission ready to be built. Mappings are read-only and in the order of their names."""
+
+    mission: Mission
+    vehicles: tuple[Multirotor | SkidSteer, ...]  # type of each member of mission.vehicles, in that order
+    detectors: Mapping[str, Detector]  # those that the team carries
+    nuclides: Mapping[str, Nuclide]  # the whole library
+    materials: Mapping[str, Material]  # the whole library
+    site: SiteSpec
+    site_file: Path  # site.yaml; the site's mesh or elevation model is named relative to its folder
+    document: Document = field(repr=False, compare=False)  # where each value stands, for messages
+
+    def problem(self, place: Place, message: str, **details: str | None) -> Problem:
+        """A `Problem` about the mission's value at ``place``, e.g. ``("sources", 0, "position_m")``."""
+        return self.document.problem(place, message, **details)
+
+    def to_yaml(self) -> str:
+        """The scenario fully resolved: every default, vehicle, detector, nuclide and material written out, and versions.
+
+        `load_scenario` reads it back to the same mission. The site stays a name; the hash of its files is among the
+        versions (``site_sha256``).
+        """
+        data = self.mission.model_dump(mode="json", exclude_none=True)
+        types = {
+            member.type: vehicle for member, vehicle in zip(self.mission.vehicles, self.vehicles, strict=True)
+        }
+        libraries: dict[str, Mapping[str, Any]] = {
+            "vehicles": types,
+            "detectors": self.detectors,
+            "nuclides": self.nuclides,
+            "materials": self.materials,
+        }
+        definitions: dict[str, Any] = {"complete": True}
+        for kind, models in libraries.items():
+            definitions[kind] = {
+                name: model.model_dump(mode="json", exclude_none=True) for name, model in models.items()
+            }
+        data |= {"definitions": definitions, "versions": self.versions()}
+        return dump_yaml(data)
+
+    def versions(self) -> dict[str, str]:
+        """What this scenario runs with: Python, the packages that decide results, and the hash of the site's files."""
+        found = {"python": platform.python_version()}
+        for package in _VERSIONED:
+            try:
+                found[package] = importlib.metadata.version(package)
+            except importlib.metadata.PackageNotFoundError:
+                found[package] = "not installed"
+        digest = hashlib.sha256(self.site_file.read_bytes())
+        geometry = self.site_file.parent / self.site.file
+        if geometry.is_file():
+            digest.update(geometry.read_bytes())
+        return found | {"site_sha256": digest.hexdigest()}
+
+
+def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
+    """The scenario of a shipped mission's name or of a mission file, with ``path=value`` overrides and a seed.
+
+    Raises `InputError` with everything that is wrong with it, apart from what needs the site's geometry
+    (`swarmsim.config.geometry.check_geometry`).
+    """
+    path = files.find("missions", name_or_path)
+    document = read_document(path, "missions")
+    overrides = (*overrides, f"seed={seed}") if seed is not None else tuple(overrides)
+    problems = [*_bring_in_definitions(document, overrides, path)]
+    try:
+        apply_overrides(document, overrides, shape_of(Mission))
+    except InputError as error:
+        problems += error.problems
+    return _resolve(document, path, problems)
+
+
+def scenario_of(mission: Mission, near: Path | None = None) -> Scenario:
+    """The scenario of a mission made in Python; ``near`` is a file beside whose ``configs`` names are looked up."""
+    return _resolve(Document(mission.model_dump(mode="json", exclude_none=True)), near, [])
+
+
+def _resolve(document: Document, near: Path | None, problems: list[Problem]) -> Scenario:
+    mission: Mission | None = None
+    try:
+        mission = validate(document, Mission)
+    except InputError as error:
+        problems += error.problems
+    at_fault = {problem.path for problem in problems}
+    problems += [problem for problem in check_references(document, near) if problem.path not in at_fault]
+    raise_if_any(problems)
+    assert mission is not None
+    found = _look_up(mission, document, near)
+    raise_if_any(check_consistency(mission, found.vehicles, found.detectors, found.materials, found.site, document))
+    return found
+
+
+def _look_up(mission: Mission, document: Document, near: Path | None) -> Scenario:
+    """Everything that the mission names, loaded; the names are known to exist, but the files may be wrong."""
+    own = mission.definitions
+    problems: list[Problem] = []
+
+    def gather(kind: str, name: str) -> Any:
+        defined = getattr(own, kind)
+        if name in defined:
+            return defined[name]
+        try:
+            return load_named(kind, name, near)
+        except InputError as error:
+            problems.extend(problem for problem in error.problems if problem not in problems)
+
+    def library(kind: str) -> dict[str, Any]:
+        names = known_names(document.data, kind, near)
+        return {name: gather(kind, name) for name in names}
+
+    types = {name: gather("vehicles", name) for name in dict.fromkeys(m.type for m in mission.vehicles)}
+    nuclides, materials = library("nuclides"), library("materials")
+    site_file = files.find("sites", mission.site, near)
+    site: SiteSpec | None = None
+    try:
+        site = load_named("sites", mission.site, near)
+    except InputError as error:
+        problems += error.problems
+    raise_if_any(problems)
+    assert site is not None
+    vehicles = tuple(types[member.type] for member in mission.vehicles)
+    raise_if_any(check_detectors(mission, vehicles, document, near))
+    carried = sorted({vehicle.detector.model for vehicle in vehicles if vehicle.detector is not None})
+    detectors = {name: gather("detectors", name) for name in carried}
+    raise_if_any(problems)
+    return Scenario(
+        mission=mission,
+        vehicles=vehicles,
+        detectors=MappingProxyType(detectors),
+        nuclides=MappingProxyType(nuclides),
+        materials=MappingProxyType(materials),
+        site=site,
+        site_file=site_file,
+        document=document,
+    )
+
+
+def _bring_in_definitions(document: Document, overrides: Sequence[str], near: Path) -> list[Problem]:
+    """Copy into ``definitions`` what overrides change there: ``definitions.vehicles.tarot_t650.mass_kg=4``."""
+    problems: list[Problem] = []
+    for text in overrides:
+        steps = text.partition("=")[0].strip().split(".")
+        if steps[0] != "definitions" or len(steps) < 4 or steps[1] not in ("vehicles", "detectors", "nuclides"):
+            continue
+        place: Place = tuple(steps[:3])
+        if item(item(item(document.data, place[0]), place[1]), place[2]) is not None:
+            continue
+        try:
+            source = read_document(files.find(steps[1], steps[2], near), steps[1])
+        except InputError as error:
+            problems += error.problems
+            continue
+        definitions = document.data.setdefault("definitions", {})
+        definitions.setdefault(steps[1], {})[steps[2]] = source.data
+        document.marks |= {(*place, *inner): mark for inner, mark in source.marks.items()}
+    return problems

@@ -1,0 +1,235 @@
+"""Vehicles as a user writes them: every number in SI, every number with its source."""
+
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, PositiveVec3, Vec3
+from swarmsim.config.radiation import DetectorMount
+
+
+def _numeric_paths(value: Any, path: str = "") -> Iterator[str]:
+    """Dotted path of every number in nested mappings and sequences; items of a sequence are numbered from 0."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _numeric_paths(item, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from _numeric_paths(item, f"{path}.{index}")
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield path
+
+
+class Sourced(Model):
+    """A model whose every number has its source in ``sources``: dotted path to where the number is from.
+
+    A path covers its children: ``rotor`` covers ``rotor.radius_m``, ``rotors`` covers ``rotors.0.position_m.2``.
+    """
+
+    sources: dict[str, str]
+
+    @model_validator(mode="after")
+    def _every_number_has_a_source(self) -> "Sourced":
+        numbers = list(_numeric_paths(self.model_dump(exclude={"sources"})))
+        named = tuple(self.sources)
+
+        def covers(source: str, path: str) -> bool:
+            return path == source or path.startswith(f"{source}.")
+
+        missing = [path for path in numbers if not any(covers(source, path) for source in named)]
+        unused = [source for source in named if not any(covers(source, path) for path in numbers)]
+        empty = [source for source in named if not self.sources[source].strip()]
+        faults = [
+            f"{what}: {', '.join(paths[:8])}{' …' if len(paths) > 8 else ''}"
+            for what, paths in (
+                ("no source is given for", missing),
+                ("no number stands at the path of the source", unused),
+                ("the source is empty for", empty),
+            )
+            if paths
+        ]
+        if faults:
+            raise ValueError("; ".join(faults) + " (a path such as 'rotor' covers everything below it)")
+        return self
+
+
+class BodyFile(Model):
+    """A URDF, xacro or MJCF file that gives the body (mass, inertia, visual geometry), with its xacro arguments."""
+
+    file: str
+    args: dict[str, str | float | int | bool] = Field(default_factory=dict)
+
+
+class Battery(Model):
+    """Energy store: capacity, efficiency from battery to shaft, and what the avionics draw."""
+
+    capacity_wh: Positive
+    drive_efficiency: Annotated[float, Field(gt=0, le=1)]
+    avionics_power_w: NonNegative
+
+
+class Rotor(Model):
+    """One rotor's place (body FLU) and the sense in which it turns seen from above."""
+
+    position_m: Vec3
+    spin: Literal["ccw", "cw"]
+
+
+class RotorModel(Model):
+    """Propeller and motor: thrust = k w^2, torque = c thrust, first-order lag of the speed.
+
+    The motor turns between ``speed_min_rad_s`` (idle) and ``speed_max_rad_s``, or stands still when it is disarmed.
+    """
+
+    thrust_coefficient_n_s2: Positive
+    moment_constant_m: Positive
+    time_constant_up_s: Positive
+    time_constant_down_s: Positive
+    speed_min_rad_s: NonNegative
+    speed_max_rad_s: Positive
+    inertia_kg_m2: NonNegative
+    radius_m: Positive
+
+
+class Feet(Model):
+    """Spring-damper landing feet (body FLU, from the centre of mass) with regularised Coulomb friction.
+
+    Stiffness and damping are those of one foot, normal to the ground; ``tangential_stiffness_n_m`` is the elastic give
+    of a foot that sticks.
+    """
+
+    positions_m: tuple[Vec3, ...] = Field(min_length=3)
+    stiffness_n_m: Positive
+    tangential_stiffness_n_m: Positive
+    damping_n_s_m: NonNegative
+    friction: NonNegative
+
+
+class MultirotorControl(Model):
+    """Cascaded controller: natural frequencies and limits."""
+
+    position_gain_1_s: Positive
+    velocity_gain_1_s: Positive
+    velocity_integral_1_s2: NonNegative
+    attitude_gain_1_s: Positive
+    yaw_gain_1_s: Positive
+    rate_gain_1_s: Positive
+    yaw_rate_max_deg_s: Positive
+    tilt_max_deg: float = Field(gt=0, lt=80)
+    speed_max_m_s: Positive
+    climb_rate_max_m_s: Positive
+    acceleration_max_m_s2: Positive
+
+
+class Multirotor(Sourced):
+    """A multirotor (``configs/vehicles/<name>.yaml``).
+
+    ``collision_radius_m`` and ``collision_height_m`` are those of the upright cylinder around the vehicle, propellers
+    and feet included.
+    """
+
+    kind: Literal["multirotor"]
+    name: Name
+    description: str
+    mass_kg: Positive
+    inertia_kg_m2: PositiveVec3
+    rotors: tuple[Rotor, ...] = Field(min_length=3)
+    rotor: RotorModel
+    drag_quadratic_kg_m: Annotated[float, Field(ge=0)]
+    feet: Feet
+    collision_radius_m: Positive
+    collision_height_m: Positive
+    impact_speed_max_m_s: Positive
+    battery: Battery
+    control: MultirotorControl
+    detector: DetectorMount | None = None
+    body: BodyFile | None = None
+
+    @model_validator(mode="after")
+    def _can_fly(self) -> "Multirotor":
+        rotor = self.rotor
+        if rotor.speed_max_rad_s <= rotor.speed_min_rad_s:
+            raise ValueError("rotor.speed_max_rad_s must be more than rotor.speed_min_rad_s")
+        thrust = len(self.rotors) * rotor.thrust_coefficient_n_s2 * rotor.speed_max_rad_s**2
+        if thrust <= 9.81 * self.mass_kg:
+            raise ValueError(
+                f"the rotors lift {thrust:.1f} N at most, the vehicle weighs {9.81 * self.mass_kg:.1f} N: "
+                "check mass_kg, rotor.thrust_coefficient_n_s2 and rotor.speed_max_rad_s"
+            )
+        if len({r.spin for r in self.rotors}) < 2:
+            raise ValueError("rotors must turn both ways (spin ccw and cw), or nothing holds the yaw")
+        return self
+
+
+class Wheels(Model):
+    """Four driven wheels: radius, mass, spacing and friction with the ground."""
+
+    radius_m: Positive
+    width_m: Positive
+    mass_kg: Positive
+    wheel_base_m: Positive
+    track_m: Positive
+    friction: Positive
+    rolling_resistance: NonNegative
+
+
+class WheelMotor(Model):
+    """Wheel motor with its speed loop: torque limit, first-order torque lag, loop gain.
+
+    ``rotor_inertia_kg_m2`` is that of rotor and gears as the wheel feels it, the square of the gear ratio included.
+    """
+
+    rotor_inertia_kg_m2: NonNegative
+    torque_max_nm: Positive
+    time_constant_s: Positive
+    speed_gain_nm_s: Positive
+    speed_max_rad_s: Positive
+
+
+class Bumper(Model):
+    """Spring-damper of each corner of the rover's outline against walls."""
+
+    stiffness_n_m: Positive
+    damping_n_s_m: NonNegative
+
+
+class SkidSteerControl(Model):
+    """Path following of a skid-steer rover (pure pursuit)."""
+
+    lookahead_m: Positive
+    speed_max_m_s: Positive
+    yaw_rate_max_rad_s: Positive
+    acceleration_max_m_s2: Positive
+    yaw_gain_1_s: Positive
+
+
+class SkidSteer(Sourced):
+    """A four-wheel skid-steer rover (``configs/vehicles/<name>.yaml``)."""
+
+    kind: Literal["skid_steer"]
+    name: Name
+    description: str
+    mass_kg: Positive
+    chassis_size_m: PositiveVec3
+    chassis_height_m: Positive
+    wheels: Wheels
+    motor: WheelMotor
+    bumper: Bumper
+    impact_speed_max_m_s: Positive
+    slope_max_deg: float = Field(gt=0, lt=60)
+    step_max_m: Positive
+    battery: Battery
+    control: SkidSteerControl
+    detector: DetectorMount | None = None
+    body: BodyFile | None = None
+
+    @model_validator(mode="after")
+    def _heavier_than_its_wheels(self) -> "SkidSteer":
+        if self.mass_kg <= 4 * self.wheels.mass_kg:
+            raise ValueError("mass_kg is the whole rover: it must be more than four times wheels.mass_kg")
+        return self
+
+
+Vehicle = Annotated[Multirotor | SkidSteer, Field(discriminator="kind")]
+__all__ = ["Battery", "Fraction", "Multirotor", "SkidSteer", "Vehicle"]

@@ -1,0 +1,1 @@
+"""From a setpoint to rotor and wheel commands."""

@@ -1,0 +1,126 @@
+"""Cascaded control of a multirotor: position, velocity, attitude, body rate, rotor thrusts.
+
+The structure is that of PX4 and of Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control", IEEE
+Transactions on Control Systems Technology 28(2), 2020: the tilt, which carries the thrust, comes before the yaw.
+World ENU, body FLU, SI units; one vehicle. Run it every 10 ms.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.physics.rigid_body import rotation_matrix, to_body
+from swarmsim.pytree import pytree
+from swarmsim.vehicles.multirotor import ControlParams, MultirotorParams
+from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
+
+LIFT_MIN = 0.2
+"""Least vertical part of the commanded thrust over the weight: below it the thrust's direction means nothing."""
+
+
+@pytree
+class Setpoint:
+    """Where a multirotor should be, with its velocity and acceleration fed forward."""
+
+    position_m: jax.Array  # [3] m, world
+    velocity_m_s: jax.Array  # [3] m/s, world
+    acceleration_m_s2: jax.Array  # [3] m/s^2, world
+    yaw_rad: jax.Array  # [] rad, counter-clockwise from east
+
+
+@pytree
+class ControlMemory:
+    """What the controller carries from call to call."""
+
+    integral_m_s2: jax.Array  # [3] m/s^2, world: acceleration that holds against wind, payload and model error
+
+
+def control_start() -> ControlMemory:
+    """Memory of a controller that has not run yet."""
+    return ControlMemory(integral_m_s2=jnp.zeros(3))
+
+
+def control(
+    params: MultirotorParams, memory: ControlMemory, state: MultirotorState, setpoint: Setpoint, dt: float
+) -> tuple[jax.Array, ControlMemory]:
+    """Rotor commands [R] rad/s towards ``setpoint`` and the controller's memory ``dt`` s later.
+
+    Only ``params.control`` is read: the controller does not know the true mass. The commands never disarm a rotor.
+    """
+    autopilot, body = params.control, state.body
+    acceleration, memory = _acceleration(autopilot, memory, body, setpoint, dt)
+    pull = acceleration + jnp.array([0.0, 0.0, GRAVITY_M_S2], acceleration.dtype)
+    attitude = rotation_matrix(body.quaternion)
+    pull_body = to_body(attitude, pull)
+    rate = _body_rate(autopilot, attitude, pull_body, setpoint.yaw_rad)
+    w, inertia = body.angular_velocity_rad_s, autopilot.inertia_kg_m2
+    torque = inertia * autopilot.rate_gain_1_s * (rate - w) + jnp.cross(w, inertia * w)
+    thrust = autopilot.mass_kg * jnp.maximum(pull_body[2], 0.0)
+    return rotor_commands(autopilot, thrust, torque), memory
+
+
+def rotor_commands(autopilot: ControlParams, thrust_n: jax.Array, torque_nm: jax.Array) -> jax.Array:
+    """Rotor speeds [R] rad/s that give thrust [] N and torque [3] N m (body) as far as the motors can.
+
+    What they cannot is given up in this order: yaw torque, then thrust, then roll and pitch torque.
+    """
+    lowest = autopilot.thrust_coefficient_n_s2 * autopilot.speed_min_rad_s**2
+    highest = autopilot.thrust_coefficient_n_s2 * autopilot.speed_max_rad_s**2
+    mix = autopilot.allocation
+    tilting = mix[:, 1] * torque_nm[0] + mix[:, 2] * torque_nm[1]
+    lifting = mix[:, 0] * thrust_n
+    turning = mix[:, 3] * torque_nm[2]
+    level = lifting + tilting
+    # Move the collective thrust so that roll and pitch fit; if they are too large for that, keep the middle.
+    room_above, room_below = highest - jnp.max(level), jnp.min(level) - lowest
+    shift = jnp.where(
+        room_above + room_below < 0.0,
+        0.5 * (room_above - room_below),
+        jnp.minimum(room_above, 0.0) + jnp.maximum(-room_below, 0.0),
+    )
+    level = jnp.clip(level + shift, lowest, highest)
+    room = jnp.where(turning > 0.0, highest - level, level - lowest)
+    share = jnp.minimum(1.0, jnp.min(room / jnp.maximum(jnp.abs(turning), 1e-6)))
+    return jnp.sqrt((level + share * turning) / autopilot.thrust_coefficient_n_s2)
+
+
+def _acceleration(
+    autopilot: ControlParams, memory: ControlMemory, body: RigidState, setpoint: Setpoint, dt: float
+) -> tuple[jax.Array, ControlMemory]:
+    """Wanted acceleration [3] m/s^2 (world) within the limits; the integral stands still where it would wind up."""
+    approach = autopilot.position_gain_1_s * (setpoint.position_m - body.position_m)
+    limits = jnp.stack([autopilot.speed_max_m_s, autopilot.climb_rate_max_m_s])
+    velocity = _limited(setpoint.velocity_m_s + approach, limits)
+    error = velocity - body.velocity_m_s
+    wanted = setpoint.acceleration_m_s2 + autopilot.velocity_gain_1_s * error + memory.integral_m_s2
+    reach = autopilot.acceleration_max_m_s2
+    tilt = jnp.minimum(reach, autopilot.tilt_max_tan * jnp.maximum(GRAVITY_M_S2 + wanted[2], LIFT_MIN * GRAVITY_M_S2))
+    floor = (LIFT_MIN - 1.0) * GRAVITY_M_S2
+    given = _limited(wanted, jnp.stack([tilt, reach]))
+    given = given.at[2].set(jnp.maximum(given[2], floor))
+    winding = (wanted - given) * error > 0.0  # the limit already cuts in the direction in which it would grow
+    integral = memory.integral_m_s2 + jnp.where(winding, 0.0, autopilot.velocity_integral_1_s2 * dt * error)
+    return given, ControlMemory(integral_m_s2=_limited(integral, jnp.stack([reach, reach])))
+
+
+def _limited(v: jax.Array, limits: jax.Array) -> jax.Array:
+    """Vector ``v`` [3] with its horizontal length and its height held to ``limits`` [2]."""
+    length = jnp.sqrt(v[0] * v[0] + v[1] * v[1] + 1e-12)
+    share = jnp.minimum(1.0, limits[0] / length)
+    return jnp.stack([share * v[0], share * v[1], jnp.clip(v[2], -limits[1], limits[1])])
+
+
+def _body_rate(autopilot: ControlParams, attitude: jax.Array, pull_body: jax.Array, yaw_rad: jax.Array) -> jax.Array:
+    """Wanted body rate [3] rad/s that turns body z onto the wanted thrust, and the heading onto ``yaw_rad``."""
+    direction = pull_body * jax.lax.rsqrt(jnp.sum(pull_body * pull_body) + 1e-12)
+    # 2 sin(angle / 2) about the axis z x direction: proportional for small angles, still growing when upside down.
+    reach = autopilot.attitude_gain_1_s * jax.lax.rsqrt(jnp.maximum(0.5 * (1.0 + direction[2]), 1e-4))
+    forward_x, forward_y = attitude[0, 0], attitude[1, 0]
+    cosine, sine = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
+    heading_error = jnp.arctan2(
+        forward_x * sine - forward_y * cosine, forward_x * cosine + forward_y * sine + 1e-9
+    )
+    turn = jnp.clip(autopilot.yaw_gain_1_s * heading_error, -autopilot.yaw_rate_max_rad_s, autopilot.yaw_rate_max_rad_s)
+    about_vertical = turn * attitude[2]  # the world's vertical in the body frame
+    return jnp.stack(
+        [about_vertical[0] - reach * direction[1], about_vertical[1] + reach * direction[0], about_vertical[2]]
+    )

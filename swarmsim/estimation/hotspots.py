@@ -1,0 +1,62 @@
+"""Hotspots of a radiation map, and where the search for a source starts."""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.estimation.radiation_map import MappingParams, RadiationMap
+from swarmsim.pytree import pytree
+
+GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
+
+
+@pytree
+class Hotspots:
+    """Places of significant excess, strongest first. Those not ``valid`` stand at the map's largest significance."""
+
+    position_m: jax.Array  # [h, 2] m, cell centre, world ENU
+    significance: jax.Array  # [h] standard deviations above background
+    valid: jax.Array  # [h] bool
+
+
+def extract_hotspots(params: MappingParams, radiation_map: RadiationMap) -> Hotspots:
+    """The cells that are the most significant of their neighbourhood and above ``params.significance_sigma``.
+
+    The neighbourhood is a square that reaches one hotspot separation to each side, so two hotspots are further apart than
+    that, and the flank of a strong one is none itself. Significances are standard normal under bare background, so the
+    chance of any false hotspot is at most (cells) x Q(sigma) by the union bound: 1.1e-3 for 4000 cells at 5 sigma.
+    """
+    significance = radiation_map.significance
+    ny, nx = significance.shape
+    width = 2 * params.separation_cells + 1
+    highest = significance
+    for window in ((width, 1), (1, width)):
+        highest = jax.lax.reduce_window(highest, -jnp.inf, jax.lax.max, window, (1, 1), "SAME")
+    peak = (significance >= highest) & (significance >= params.significance_sigma)
+    candidates = jnp.where(peak, significance, -jnp.inf).reshape(-1)
+    count = min(params.hotspots_max, nx * ny)
+    value, index = jax.lax.top_k(candidates, count)
+    value = jnp.pad(value, (0, params.hotspots_max - count), constant_values=-jnp.inf)
+    index = jnp.pad(index, (0, params.hotspots_max - count))
+    valid = jnp.isfinite(value)
+    best = jnp.argmax(significance)
+    index = jnp.where(valid, index, best)
+    cell = jnp.stack([index % nx, index // nx], axis=-1)
+    return Hotspots(
+        position_m=params.origin_m + params.cell_m * cell,
+        significance=jnp.where(valid, value, significance.reshape(-1)[best]),
+        valid=valid,
+    )
+
+
+def initial_points(params: MappingParams, hotspots: Hotspots, starts: int) -> jax.Array:
+    """Starting points [starts, 2] (m, world ENU) of a localisation: the hotspots, then points around the strongest.
+
+    The latter lie on a spiral out to twice the map's length scale, for a source that walls hide from straight above.
+    """
+    kept = min(hotspots.valid.shape[0], starts)
+    i = jnp.arange(starts)
+    radius = 2.0 * params.length_scale_m * jnp.sqrt(i / starts)
+    angle = GOLDEN_ANGLE_RAD * i
+    around = hotspots.position_m[0] + radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    own = jnp.pad(hotspots.position_m[:kept], ((0, starts - kept), (0, 0)))
+    return jnp.where(jnp.pad(hotspots.valid[:kept], (0, starts - kept))[:, None], own, around)

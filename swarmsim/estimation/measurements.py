@@ -1,0 +1,81 @@
+"""Detector measurements as arrays of fixed size, and their sums over windows."""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.pytree import pytree
+
+
+@pytree
+class Measurements:
+    """Counting intervals of one mission. Rows that are not ``valid`` are padding: their contents never matter."""
+
+    time_s: jax.Array  # [n] s, end of the interval, mission clock
+    position_m: jax.Array  # [n, 3] m, crystal, world ENU
+    axis: jax.Array  # [n, 3] unit vector along the crystal's axis, world
+    counts: jax.Array  # [n] counts in the interval
+    exposure_s: jax.Array  # [n] s, live time that the counts stand for
+    valid: jax.Array  # [n] bool
+    detector: jax.Array  # [n] int32, index into the tuple of detectors (UAV, rover)
+
+
+def aggregate(measurements: Measurements, per_window: int) -> Measurements:
+    """Sum every ``per_window`` consecutive measurements to one window.
+
+    Counts and exposures add up (a sum of Poisson variables is Poisson); the position is the exposure-weighted mean, the axis the
+    exposure-weighted mean made a unit vector again, the time that of the last valid sample, the detector that of the first. The rate
+    at the mean position differs from the mean rate by about (v T)² / 24 times the rate's curvature: 0.3 % for a window of 2.5 m seen
+    from 20 m. Samples must be ordered so that a window holds one vehicle (and one detector) only: aggregate each vehicle's own
+    samples (vmap over vehicles), then `concatenate`. A remainder shorter than a window makes a last, shorter window.
+
+    Args:
+        measurements: n samples.
+        per_window: samples in a window, at least 1 (static).
+
+    Returns:
+        Measurements with ceil(n / per_window) rows; a window without a valid sample is not valid.
+
+    Raises:
+        ValueError: ``per_window`` is below 1.
+    """
+    if per_window < 1:
+        raise ValueError(f"a window needs at least one sample: per_window is {per_window}")
+    n = measurements.counts.shape[0]
+    windows = -(-n // per_window)
+
+    def windowed(x: jax.Array) -> jax.Array:
+        padded = jnp.pad(x, [(0, windows * per_window - n)] + [(0, 0)] * (x.ndim - 1))
+        return padded.reshape(windows, per_window, *x.shape[1:])
+
+    m = jax.tree.map(windowed, measurements)
+    exposure = jnp.where(m.valid, m.exposure_s, 0.0)
+    total = jnp.sum(exposure, axis=1)
+    weight = (exposure / jnp.maximum(total, 1e-12)[:, None])[..., None]
+    # Positions relative to the window's first sample: a mean of large coordinates would lose digits in float32.
+    first = m.position_m[:, 0]
+    offset = jnp.where(m.valid[..., None], m.position_m - first[:, None], 0.0)
+    axis = jnp.sum(weight * jnp.where(m.valid[..., None], m.axis, 0.0), axis=1)
+    norm = jnp.linalg.norm(axis, axis=-1, keepdims=True)
+    return Measurements(
+        time_s=jnp.max(jnp.where(m.valid, m.time_s, -jnp.inf), axis=1, initial=0.0),  # mission clocks start at zero
+        position_m=first + jnp.sum(weight * offset, axis=1),
+        axis=jnp.where(norm > 1e-6, axis / jnp.maximum(norm, 1e-6), jnp.array([0.0, 0.0, 1.0])),
+        counts=jnp.sum(jnp.where(m.valid, m.counts, 0), axis=1),
+        exposure_s=total,
+        valid=jnp.any(m.valid, axis=1) & (total > 0.0),
+        detector=m.detector[:, 0],
+    )
+
+
+def concatenate(*parts: Measurements) -> Measurements:
+    """Measurements of several vehicles or phases after one another; leading axes (vehicle, sample) are flattened first."""
+
+    def flat(x: jax.Array, trailing: int) -> jax.Array:
+        return x.reshape(-1, *x.shape[x.ndim - trailing :]) if trailing else x.reshape(-1)
+
+    def join(*leaves: jax.Array, trailing: int) -> jax.Array:
+        return jnp.concatenate([flat(leaf, trailing) for leaf in leaves])
+
+    vectors = ("position_m", "axis")
+    names = Measurements.__dataclass_fields__  # type: ignore[attr-defined]
+    return Measurements(**{f: join(*(getattr(p, f) for p in parts), trailing=int(f in vectors)) for f in names})

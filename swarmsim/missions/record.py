@@ -1,0 +1,174 @@
+"""What one flown mission leaves behind, as numpy arrays on the host: the input of everything that is written or shown."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmsim.config.vehicles import Multirotor, SkidSteer
+
+Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened to a vehicle: ``kind`` is crash, collision, landed, battery_empty, non_finite …"""
+
+    time_s: float
+    vehicle: str
+    kind: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a vehicle looks like, as far as a picture needs it: a box with discs (rotors or wheels). Body frame FLU."""
+
+    hubs_m: Floats  # [k, 3] centres of the rotors or wheels
+    radius_m: float  # of a rotor or wheel
+    width_m: float  # of a wheel; 0 for a rotor
+    box_centre_m: Floats  # [3]
+    box_size_m: Floats  # [3] length, width, height
+
+
+def shape_of(spec: Multirotor | SkidSteer) -> Shape:
+    """The shape that a vehicle's specification describes; a multirotor's box is its hub, between rotors and feet."""
+    if isinstance(spec, Multirotor):
+        hubs = np.array([r.position_m for r in spec.rotors], float)
+        feet = np.array(spec.feet.positions_m, float)
+        side = 0.8 * float(np.linalg.norm(hubs[:, :2], axis=1).mean())
+        top, bottom = float(hubs[:, 2].mean()), float(feet[:, 2].mean())
+        height = max(0.4 * (top - bottom), 0.25 * side)
+        return Shape(
+            hubs_m=hubs,
+            radius_m=spec.rotor.radius_m,
+            width_m=0.0,
+            box_centre_m=np.array([0.0, 0.0, top - 0.5 * height]),
+            box_size_m=np.array([side, 0.7 * side, height]),
+        )
+    wheels = spec.wheels
+    x, y = 0.5 * wheels.wheel_base_m, 0.5 * wheels.track_m
+    # The origin is the chassis' centre, chassis_height_m above the ground; the axles are a wheel radius above it.
+    z = wheels.radius_m - spec.chassis_height_m
+    return Shape(
+        hubs_m=np.array([[x, y, z], [x, -y, z], [-x, y, z], [-x, -y, z]]),
+        radius_m=wheels.radius_m,
+        width_m=wheels.width_m,
+        box_centre_m=np.zeros(3),
+        box_size_m=np.array(spec.chassis_size_m, float),
+    )
+
+
+@dataclass(frozen=True)
+class VehicleRecord:
+    """The track of one vehicle at the logging rate; world ENU, quaternion w x y z body (FLU) to world."""
+
+    name: str
+    type: str
+    kind: str  # multirotor | skid_steer
+    time_s: Floats  # [n]
+    position_m: Floats  # [n, 3]
+    quaternion: Floats  # [n, 4]
+    velocity_m_s: Floats  # [n, 3]
+    energy_wh: Floats  # [n] used since the start
+    battery_fraction: Floats  # [n] left, 0 to 1
+    crashed: bool
+    shape: Shape | None = None  # None: drawn as a generic body of its kind
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Detector measurements of all vehicles in time order."""
+
+    vehicle: NDArray[np.int32]  # [n] index into MissionRecord.vehicles
+    phase: NDArray[np.str_]  # [n] "aerial" | "ground"
+    time_s: Floats  # [n] end of the counting interval
+    position_m: Floats  # [n, 3] of the crystal
+    counts: Floats  # [n]
+    exposure_s: Floats  # [n] live interval that the counts stand for
+    count_rate_cps: Floats  # [n] counts / exposure
+
+    def of_phase(self, phase: str) -> "Samples":
+        """Those of one phase."""
+        keep = self.phase == phase
+        return Samples(*(getattr(self, f)[keep] for f in self.__dataclass_fields__))
+
+    def until(self, time_s: float) -> "Samples":
+        """Those that had ended at ``time_s``."""
+        return Samples(*(getattr(self, f)[: np.searchsorted(self.time_s, time_s, "right")] for f in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class RadiationMap:
+    """Interpolated aerial count rate on a grid; row 0 is the south edge, column 0 the west edge."""
+
+    origin_m: Floats  # [2] centre of cell [0, 0]
+    cell_m: float
+    mean_cps: Floats  # [ny, nx]
+    std_cps: Floats  # [ny, nx]
+    hotspots_m: Floats  # [h, 2] strongest first
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A source estimate with its uncertainty (one standard deviation, from the Fisher information)."""
+
+    position_m: Floats  # [3]
+    covariance_m2: Floats  # [3, 3]
+    activity_mbq: float
+    activity_std_mbq: float
+    background_scale: float  # estimated background over the detector's nominal one
+    nuclide: str  # hypothesis under which it was fitted
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """The rover's accumulated spectrum and what was read from it."""
+
+    energy_kev: Floats  # [c] channel centres
+    counts: Floats  # [c]
+    background: Floats  # [c] expected background counts in the same live time
+    fit: Floats  # [c] fitted counts of the best nuclide plus background
+    live_time_s: float
+    nuclide: str
+    confidence: float
+    scores: dict[str, float]  # posterior of every candidate nuclide
+    lines_kev: Floats = field(default_factory=lambda: np.zeros(0))  # [l] gamma lines of the named nuclide, for labels
+
+
+@dataclass(frozen=True)
+class TrueSource:
+    """Ground truth of one source."""
+
+    nuclide: str
+    position_m: Floats  # [3]
+    activity_mbq: float
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A phase of the mission and its simulated time span."""
+
+    name: str
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class MissionRecord:
+    """One mission, whole. ``aerial_estimate``, ``estimate``, ``spectrum`` are None where the mission found nothing."""
+
+    name: str
+    site: str
+    seed: int
+    phases: tuple[Phase, ...]
+    vehicles: tuple[VehicleRecord, ...]
+    samples: Samples
+    map: RadiationMap
+    aerial_estimate: Estimate | None
+    estimate: Estimate | None
+    spectrum: Spectrum | None
+    sources: tuple[TrueSource, ...]
+    route_m: Floats  # [r, 3] planned route of the rover
+    events: tuple[Event, ...]
+    finding: str  # one sentence: what the mission found

@@ -1,0 +1,73 @@
+"""Contact of a free body with the ground: spring-damper points with Coulomb friction, as a wrench.
+
+The ground below a vehicle is its tangent plane, so that the terrain can have any resolution and the body stays free of
+constraints.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.pytree import pytree
+
+
+@pytree
+class Plane:
+    """Tangent plane of the ground below a vehicle."""
+
+    point_m: jax.Array  # [3] m, world: any point of it
+    normal: jax.Array  # [3] unit vector, world, out of the ground
+
+
+@pytree
+class ContactPoints:
+    """Points of a body that can touch the ground, alike in all but place."""
+
+    position_m: jax.Array  # [C, 3] m, body
+    stiffness_n_m: jax.Array  # [] N/m, normal
+    tangential_n_m: jax.Array  # [] N/m, tangential, while the point sticks
+    damping_n_s_m: jax.Array  # [] N s/m, normal
+    friction: jax.Array  # [] Coulomb coefficient
+
+
+def contact_wrench(
+    points: ContactPoints,
+    *,
+    slip_m: jax.Array,
+    height_m: jax.Array,
+    normal: jax.Array,
+    velocity_m_s: jax.Array,
+    angular_velocity_rad_s: jax.Array,
+    dt: float,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Force [3] N, torque [3] N m about the body's origin and the new slip [C, 3] m, all in the body frame.
+
+    ``height_m`` [C] are the points' heights above the plane (negative inside), ``normal`` [3] the plane's normal,
+    ``velocity_m_s`` [3] and ``angular_velocity_rad_s`` [3] those of the body, all body frame; ``slip_m`` [C, 3] is the
+    elastic give of each point along the plane, which a step of ``dt`` s moves on.
+
+    Normal: a spring with a damper that never pulls. Tangential: Coulomb friction regularised by a spring that gives way
+    at the friction cone (Cundall and Strack, "A discrete numerical model for granular assemblies", Géotechnique 29(1),
+    1979), so that a vehicle on a slope rests and does not creep, as it would on a viscous regularisation. The tangential
+    damper is the normal one times the ratio of the stiffnesses.
+    """
+    w = angular_velocity_rad_s
+    velocity = velocity_m_s + _cross(w, points.position_m)
+    closing = jnp.sum(velocity * normal, axis=-1)
+    touching = height_m < 0.0
+    push = jnp.where(
+        touching, jnp.maximum(-points.stiffness_n_m * height_m - points.damping_n_s_m * closing, 0.0), 0.0
+    )
+    along = velocity - closing[:, None] * normal
+    give = slip_m - jnp.sum(slip_m * normal, axis=-1, keepdims=True) * normal + dt * along
+    ratio = points.tangential_n_m / points.stiffness_n_m
+    stick = -points.tangential_n_m * give - ratio * points.damping_n_s_m * along
+    cone = points.friction * push
+    # The small term keeps the gradient finite where nothing pulls; a force of 1 mN is far below any cone that matters.
+    share = jnp.minimum(1.0, cone * jax.lax.rsqrt(jnp.sum(stick * stick, axis=-1) + 1e-6))[:, None]
+    force = share * stick + push[:, None] * normal
+    return jnp.sum(force, axis=0), jnp.sum(_cross(points.position_m, force), axis=0), share * give
+
+
+def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Cross product of vectors [..., 3], as rolls that XLA fuses into what uses them."""
+    return jnp.roll(a, -1, -1) * jnp.roll(b, -2, -1) - jnp.roll(a, -2, -1) * jnp.roll(b, -1, -1)

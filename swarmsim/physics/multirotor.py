@@ -1,0 +1,213 @@
+"""How a multirotor moves: two engines behind one signature.
+
+Both take the same loads (rotors, drag, feet) and differ in who integrates the body: ``mjx`` steps MuJoCo's model of it,
+``analytic`` the closed form of a free body.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from swarmsim.config.errors import InputError
+from swarmsim.config.vehicles import Multirotor
+from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench
+from swarmsim.physics.rigid_body import free_body_step, rotation_matrix, to_body, to_world
+from swarmsim.physics.rotations import from_yaw, multiply
+from swarmsim.pytree import pytree
+from swarmsim.vehicles.multirotor import MultirotorParams, battery_power, multirotor_mjcf, rotor_speeds, wrench
+from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
+
+Engine = Literal["mjx", "analytic"]
+Step = Callable[[MultirotorParams, MultirotorState, jax.Array, jax.Array, Plane], MultirotorState]
+Integrate = Callable[[MultirotorParams, RigidState, jax.Array, jax.Array], RigidState]
+
+
+@pytree
+class Loads:
+    """What acts on the body during one step, and what the step makes of the rest of the state."""
+
+    force_n: jax.Array  # [3] N, world
+    torque_nm: jax.Array  # [3] N m, body
+    rotor_speed_rad_s: jax.Array  # [R] rad/s at the end of the step
+    contact_slip_m: jax.Array  # [C, 3] m, body, at the end of the step
+    power_w: jax.Array  # [] W from the battery
+
+
+def make_multirotor_step(spec: Multirotor, engine: Engine, dt: float) -> Step:
+    """The function ``step(params, state, rotor_command_rad_s [R], wind_m_s [3] world, ground) -> state`` over ``dt`` s.
+
+    ``spec`` gives the number of rotors and feet; everything else of it comes from ``params``, so that masses, drags and
+    the like are swept without compiling anew. A command at or below zero disarms its rotor. The step is pure, of one
+    vehicle, and has no loop that a non-finite input could keep alive.
+
+    Raises `InputError` for an unknown engine, or where ``dt`` is too long for the feet.
+    """
+    engines = {"mjx": _mjx_body, "analytic": _analytic_body}
+    if engine not in engines:
+        raise InputError.of(f"there is no engine '{engine}': choose one of {', '.join(engines)}")
+    longest = longest_time_step(spec)
+    if dt > longest:
+        raise InputError.of(
+            f"a time step of {dt} s is too long for the feet of {spec.name}: use {longest:.4f} s or less, "
+            "or softer feet (feet.stiffness_n_m, feet.damping_n_s_m)"
+        )
+    integrate = engines[engine](spec, dt)
+
+    def step(
+        params: MultirotorParams, state: MultirotorState, rotor_command_rad_s: jax.Array, wind_m_s: jax.Array, ground: Plane
+    ) -> MultirotorState:
+        loads = step_loads(params, state, rotor_command_rad_s, wind_m_s, ground, dt)
+        return MultirotorState(
+            body=integrate(params, state.body, loads.force_n, loads.torque_nm),
+            rotor_speed_rad_s=loads.rotor_speed_rad_s,
+            contact_slip_m=loads.contact_slip_m,
+            energy_j=state.energy_j + dt * loads.power_w,
+        )
+
+    return step
+
+
+def step_loads(
+    params: MultirotorParams,
+    state: MultirotorState,
+    rotor_command_rad_s: jax.Array,
+    wind_m_s: jax.Array,
+    ground: Plane,
+    dt: float,
+) -> Loads:
+    """Loads on the vehicle over a step of ``dt`` s; the wind [3] m/s is the air's velocity in the world."""
+    body = state.body
+    attitude = rotation_matrix(body.quaternion)
+    velocity = to_body(attitude, body.velocity_m_s)
+    normal = to_body(attitude, ground.normal)
+    height = jnp.sum((body.position_m - ground.point_m) * ground.normal)
+    contact_height = height + jnp.sum(params.contact_position_m * normal, axis=-1)
+    rotor_height = height + jnp.sum(params.rotor_position_m * normal, axis=-1)
+    speed = rotor_speeds(params, state.rotor_speed_rad_s, rotor_command_rad_s, dt)
+    air_force, air_torque = wrench(
+        params,
+        speed_before_rad_s=state.rotor_speed_rad_s,
+        speed_after_rad_s=speed,
+        rotor_height_m=rotor_height,
+        air_velocity_m_s=velocity - to_body(attitude, wind_m_s),
+        angular_velocity_rad_s=body.angular_velocity_rad_s,
+        dt=dt,
+    )
+    ground_force, ground_torque, slip = contact_wrench(
+        contact_points(params),
+        slip_m=state.contact_slip_m,
+        height_m=contact_height,
+        normal=normal,
+        velocity_m_s=velocity,
+        angular_velocity_rad_s=body.angular_velocity_rad_s,
+        dt=dt,
+    )
+    return Loads(
+        force_n=to_world(attitude, air_force + ground_force),
+        torque_nm=air_torque + ground_torque,
+        rotor_speed_rad_s=speed,
+        contact_slip_m=slip,
+        power_w=battery_power(params, speed_before_rad_s=state.rotor_speed_rad_s, speed_after_rad_s=speed, dt=dt),
+    )
+
+
+def contact_points(params: MultirotorParams) -> ContactPoints:
+    """The feet and rotor hubs as contact points."""
+    return ContactPoints(
+        position_m=params.contact_position_m,
+        stiffness_n_m=params.contact_stiffness_n_m,
+        tangential_n_m=params.contact_tangential_n_m,
+        damping_n_s_m=params.contact_damping_n_s_m,
+        friction=params.contact_friction,
+    )
+
+
+def rest_state(params: MultirotorParams, ground: Plane, yaw_rad: jax.Array) -> MultirotorState:
+    """The vehicle at rest on its feet at the plane's point, motors off, heading ``yaw_rad`` (from east) before tilting.
+
+    The body stands along the plane's normal and is sunk by its weight, so that it starts without a bounce.
+    """
+    feet = params.contact_position_m.shape[0] - params.rotor_spin.shape[0]
+    sink = params.mass_kg * GRAVITY_M_S2 * ground.normal[2] / (feet * params.contact_stiffness_n_m)
+    height = -jnp.min(params.contact_position_m[:, 2]) - sink
+    # Shortest turn that takes the world's z to the normal.
+    tilt = jnp.stack([1.0 + ground.normal[2], -ground.normal[1], ground.normal[0], jnp.zeros_like(ground.normal[0])])
+    upright = tilt / jnp.linalg.norm(tilt)
+    return MultirotorState(
+        body=RigidState(
+            position_m=ground.point_m + height * ground.normal,
+            quaternion=multiply(upright, from_yaw(jnp.asarray(yaw_rad, jnp.float32))),
+            velocity_m_s=jnp.zeros(3),
+            angular_velocity_rad_s=jnp.zeros(3),
+        ),
+        rotor_speed_rad_s=jnp.zeros_like(params.rotor_spin),
+        contact_slip_m=jnp.zeros_like(params.contact_position_m),
+        energy_j=jnp.zeros(()),
+    )
+
+
+def longest_time_step(spec: Multirotor) -> float:
+    """Longest step [s] at which the feet of ``spec`` are stable with a margin of two.
+
+    Semi-implicit Euler of m x'' = -k x - c x' is stable while k dt^2 / m + 2 c dt / m < 4; the stiffest motion of the
+    body on its feet is the largest eigenvalue of their stiffness over the masses and inertias it moves.
+    """
+    feet, eye = spec.feet, np.eye(3)
+    ratio = feet.tangential_stiffness_n_m / feet.stiffness_n_m
+    inverse_mass = np.diag(1.0 / np.array([spec.mass_kg] * 3 + list(spec.inertia_kg_m2)))
+    stiffness = np.zeros((6, 6))
+    for x, y, z in feet.positions_m:
+        turn = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # velocity of the foot of a unit rate
+        jacobian = np.concatenate([eye, turn], axis=1)
+        stiffness += jacobian.T @ np.diag([ratio, ratio, 1.0]) @ jacobian
+    largest = float(np.max(np.linalg.eigvals(inverse_mass @ stiffness).real))
+    k, c = largest * feet.stiffness_n_m, largest * feet.damping_n_s_m
+    return float((-c + np.sqrt(c * c + 2.0 * k)) / k)  # k dt^2 + 2 c dt = 2
+
+
+def _analytic_body(spec: Multirotor, dt: float) -> Integrate:
+    def integrate(params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array) -> RigidState:
+        return free_body_step(
+            body,
+            mass_kg=params.mass_kg,
+            inertia_kg_m2=params.inertia_kg_m2,
+            force_n=force_n,
+            torque_nm=torque_nm,
+            dt=dt,
+        )
+
+    return integrate
+
+
+def _mjx_body(spec: Multirotor, dt: float) -> Integrate:
+    compiled = mujoco.MjModel.from_xml_string(multirotor_mjcf(spec, dt, visual=False))
+    model, template = mjx.put_model(compiled), mjx.make_data(compiled)  # constants of the compiled step
+
+    def integrate(params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array) -> RigidState:
+        swept = replace(
+            model,
+            body_mass=jnp.stack([jnp.zeros_like(params.mass_kg), params.mass_kg]),
+            body_inertia=jnp.stack([jnp.zeros_like(params.inertia_kg_m2), params.inertia_kg_m2]),
+        )
+        torque_world = to_world(rotation_matrix(body.quaternion), torque_nm)
+        load = jnp.concatenate([force_n, torque_world])
+        data = template.replace(
+            qpos=jnp.concatenate([body.position_m, body.quaternion]),
+            qvel=jnp.concatenate([body.velocity_m_s, body.angular_velocity_rad_s]),
+            xfrc_applied=jnp.stack([jnp.zeros_like(load), load]),
+        )
+        data = mjx.step(swept, data)
+        return RigidState(
+            position_m=data.qpos[:3],
+            quaternion=data.qpos[3:],
+            velocity_m_s=data.qvel[:3],
+            angular_velocity_rad_s=data.qvel[3:],
+        )
+
+    return integrate

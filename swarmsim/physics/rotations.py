@@ -1,0 +1,56 @@
+"""Unit quaternions (w x y z, body to world) and the vectors they turn."""
+
+import jax
+import jax.numpy as jnp
+
+
+def rotate(q: jax.Array, v: jax.Array) -> jax.Array:
+    """Turn body vector ``v`` [..., 3] into the world frame by ``q`` [..., 4]."""
+    w, u = q[..., :1], q[..., 1:]
+    t = 2.0 * jnp.cross(u, v)
+    return v + w * t + jnp.cross(u, t)
+
+
+def rotate_inverse(q: jax.Array, v: jax.Array) -> jax.Array:
+    """Turn world vector ``v`` [..., 3] into the body frame of ``q`` [..., 4]."""
+    return rotate(conjugate(q), v)
+
+
+def conjugate(q: jax.Array) -> jax.Array:
+    """Inverse of the unit quaternion ``q`` [..., 4]."""
+    return q * jnp.array([1.0, -1.0, -1.0, -1.0], q.dtype)
+
+
+def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Hamilton product a b: first turn by ``b``, then by ``a`` [..., 4]."""
+    aw, av = a[..., :1], a[..., 1:]
+    bw, bv = b[..., :1], b[..., 1:]
+    w = aw * bw - jnp.sum(av * bv, axis=-1, keepdims=True)
+    return jnp.concatenate([w, aw * bv + bw * av + jnp.cross(av, bv)], axis=-1)
+
+
+def from_rotation_vector(r: jax.Array) -> jax.Array:
+    """Exponential map of a rotation vector ``r`` [..., 3] in rad; smooth at zero."""
+    half_squared = 0.25 * jnp.sum(r * r, axis=-1, keepdims=True)
+    small = half_squared < 1e-8
+    half = jnp.sqrt(jnp.where(small, 1.0, half_squared))
+    sinc = jnp.where(small, 1.0 - half_squared / 6.0, jnp.sin(half) / half)
+    cosine = jnp.where(small, 1.0 - 0.5 * half_squared, jnp.cos(half))
+    return jnp.concatenate([cosine, 0.5 * sinc * r], axis=-1)
+
+
+def from_yaw(yaw: jax.Array) -> jax.Array:
+    """Quaternion [..., 4] of a heading ``yaw`` [...] in rad, counter-clockwise from east."""
+    zero = jnp.zeros_like(yaw)
+    return jnp.stack([jnp.cos(0.5 * yaw), zero, zero, jnp.sin(0.5 * yaw)], axis=-1)
+
+
+def yaw_of(q: jax.Array) -> jax.Array:
+    """Heading [...] in rad of ``q`` [..., 4]."""
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    return jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def normalise(q: jax.Array) -> jax.Array:
+    """``q`` [..., 4] scaled to unit length."""
+    return q / jnp.linalg.norm(q, axis=-1, keepdims=True)

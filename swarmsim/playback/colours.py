@@ -1,0 +1,85 @@
+"""Colours of everything that is drawn: vehicles, count rates, and the marks of sources. Safe for colour-blind readers."""
+
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import LogNorm, Normalize
+from numpy.typing import NDArray
+
+from swarmsim.missions.record import MissionRecord, Samples
+
+# Okabe & Ito (2008), "Color universal design", without its black and its yellow (too pale on paper).
+_TEAM = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
+GROUND_VEHICLE = "#D55E00"
+TRUTH = "#D55E00"
+ESTIMATE = "#0072B2"
+HOTSPOT = "#000000"
+RATE_MAP = "viridis"
+
+
+def vehicle_colours(record: MissionRecord) -> list[str]:
+    """A colour (hex) for each vehicle: rovers vermilion, multirotors in turn through the rest of the palette."""
+    colours, flying = [], 0
+    for vehicle in record.vehicles:
+        if vehicle.kind == "multirotor":
+            colours.append(_TEAM[flying % len(_TEAM)])
+            flying += 1
+        else:
+            colours.append(GROUND_VEHICLE)
+    return colours
+
+
+def rgba(colour: str, alpha: int = 255) -> list[int]:
+    """``#RRGGBB`` as [r, g, b, alpha] of 0 to 255."""
+    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)] + [alpha]
+
+
+@dataclass(frozen=True)
+class RateScale:
+    """From count rate (1/s) to colour."""
+
+    norm: Normalize
+
+    def __call__(self, rate_cps: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """Colours [..., 4] (RGBA, 0 to 255) of ``rate_cps`` [...]."""
+        return np.asarray(matplotlib.colormaps[RATE_MAP](self.norm(rate_cps), bytes=True), np.uint8)
+
+    @property
+    def limits_cps(self) -> tuple[float, float]:
+        """Rates at the two ends of the scale."""
+        return float(self.norm.vmin or 0.0), float(self.norm.vmax or 0.0)
+
+
+def linear_scale(rate_cps: NDArray[np.floating]) -> RateScale:
+    """A linear scale over the bulk of ``rate_cps`` [n]: 2nd percentile to the largest."""
+    if rate_cps.size == 0:
+        return RateScale(Normalize(0.0, 1.0))
+    low, high = float(np.percentile(rate_cps, 2.0)), float(rate_cps.max())
+    return RateScale(Normalize(low, max(high, low + 1.0), clip=True))
+
+
+def log_scale(rate_cps: NDArray[np.floating]) -> RateScale:
+    """A logarithmic scale over ``rate_cps`` [n]; rates below 1 cps count as 1."""
+    if rate_cps.size == 0:
+        return RateScale(LogNorm(1.0, 10.0, clip=True))
+    low, high = max(float(rate_cps.min()), 1.0), float(rate_cps.max())
+    return RateScale(LogNorm(low, max(high, 1.1 * low), clip=True))
+
+
+def smoothed_rate(samples: Samples, window_s: float = 1.0) -> NDArray[np.floating]:
+    """Count rate [n] averaged over ``window_s`` around each sample, each vehicle by itself.
+
+    Single samples of a tenth of a second hold a handful of counts; their colours would show the Poisson noise alone.
+    Sum of counts over sum of exposures, so that both kinds of detector average rightly.
+    """
+    rate = np.zeros(len(samples.time_s))
+    for vehicle in np.unique(samples.vehicle):
+        mine = np.flatnonzero(samples.vehicle == vehicle)
+        time = samples.time_s[mine]
+        first = np.searchsorted(time, time - 0.5 * window_s, side="left")
+        last = np.searchsorted(time, time + 0.5 * window_s, side="right")
+        counts = np.r_[0.0, np.cumsum(samples.counts[mine], dtype=float)]
+        exposure = np.r_[0.0, np.cumsum(samples.exposure_s[mine], dtype=float)]
+        rate[mine] = (counts[last] - counts[first]) / np.maximum(exposure[last] - exposure[first], 1e-9)
+    return rate

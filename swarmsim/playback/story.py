@@ -1,0 +1,81 @@
+"""What the recording tells in words: the mission log, line by line, and a page that sums it up."""
+
+import numpy as np
+import rerun as rr
+
+from swarmsim.missions.record import Estimate, MissionRecord
+from swarmsim.playback.blueprint import BODY_SCALE, TIMELINE
+
+_LEVEL = {"crash": "ERROR", "collision": "ERROR", "non_finite": "ERROR", "battery_empty": "WARN"}
+
+
+def story(record: MissionRecord) -> list[tuple[float, str, str]]:
+    """Lines of the log in time order: simulated time (s), level, text."""
+    lines = []
+    for phase in record.phases:
+        lines.append((phase.start_s, "INFO", f"{phase.name} phase begins"))
+        lines.append((phase.end_s, "INFO", f"{phase.name} phase ends after {phase.end_s - phase.start_s:.0f} s"))
+    for event in record.events:
+        text = f"{event.vehicle}: {event.kind.replace('_', ' ')}" + (f" ({event.detail})" if event.detail else "")
+        lines.append((event.time_s, _LEVEL.get(event.kind, "INFO"), text))
+    survey_end = next((p.end_s for p in record.phases if p.name == "aerial"), 0.0)
+    for x, y in record.map.hotspots_m:
+        lines.append((survey_end, "INFO", f"hotspot at {x:.1f} m east, {y:.1f} m north"))
+    end = max(p.end_s for p in record.phases)
+    for when, name, estimate in (
+        (survey_end, "estimate from the air", record.aerial_estimate),
+        (end, "final estimate", record.estimate),
+    ):
+        if estimate is not None:
+            lines.append((when, "INFO", f"{name}: {describe(estimate)}"))
+    if record.spectrum is not None:
+        named = f"{record.spectrum.nuclide} with confidence {record.spectrum.confidence:.3f}"
+        lines.append((end, "INFO", f"spectrum of {record.spectrum.live_time_s:.0f} s live: {named}"))
+    lines.append((end, "INFO", record.finding))
+    return sorted(lines, key=lambda line: line[0])
+
+
+def describe(estimate: Estimate) -> str:
+    """An estimate in a few words: place and activity, each with one standard deviation."""
+    (x, y, z), (sx, sy, sz) = estimate.position_m, np.sqrt(np.diag(estimate.covariance_m2))
+    return (
+        f"{x:.2f} ± {sx:.2f} m east, {y:.2f} ± {sy:.2f} m north, {z:.2f} ± {sz:.2f} m up, "
+        f"{estimate.activity_mbq:.1f} ± {estimate.activity_std_mbq:.1f} MBq"
+    )
+
+
+def send_log(stream: rr.RecordingStream, record: MissionRecord) -> None:
+    """The log as one column of text on the mission's timeline."""
+    times, levels, texts = zip(*story(record), strict=True)
+    stream.send_columns(
+        "log/mission",
+        [rr.TimeColumn(TIMELINE, duration=np.array(times, float))],
+        rr.TextLog.columns(text=list(texts), level=list(levels)),
+    )
+
+
+def page(record: MissionRecord) -> str:
+    """The mission on one page, in Markdown."""
+    team = "\n".join(
+        f"| {v.name} | {v.type} | {float(v.energy_wh[-1]):.1f} | {'crashed' if v.crashed else 'ok'} |" for v in record.vehicles
+    )
+    truth = "\n".join(
+        f"- true: {s.nuclide}, {s.activity_mbq:.0f} MBq at "
+        f"{s.position_m[0]:.1f} m east, {s.position_m[1]:.1f} m north, {s.position_m[2]:.1f} m up" for s in record.sources
+    )
+    found = "\n".join(
+        f"- {name}: {describe(estimate)}"
+        for name, estimate in (("from the air", record.aerial_estimate), ("final", record.estimate))
+        if estimate is not None
+    )
+    return (
+        f"# {record.name}\n\nSite {record.site}, seed {record.seed}\n\n**{record.finding}**\n\n{truth}\n{found}\n\n"
+        f"| vehicle | type | energy [Wh] | |\n|---|---|---|---|\n{team}\n\n"
+        f"Vehicles are drawn {BODY_SCALE:g} times life size. Points are coloured by the count rate averaged over 1 s; "
+        "ellipsoids hold 95 %.\n"
+    )
+
+
+def send_summary(stream: rr.RecordingStream, record: MissionRecord) -> None:
+    """The page as a static document."""
+    stream.log("summary", rr.TextDocument(page(record), media_type="text/markdown"), static=True)

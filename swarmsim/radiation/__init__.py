@@ -1,0 +1,1 @@
+"""Gamma radiation: nuclides, attenuation, detector response, spectra and identification."""

@@ -1,0 +1,69 @@
+"""Where a rover can drive, how far it is from what stops it, and what a metre of it costs."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from swarmsim.config.site import Traversability, Zone
+from swarmsim.site.obstacles import Box, footprint
+from swarmsim.site.raster import Floats, Grid, edges_on, faces_on, highest, in_polygon, lowest
+
+Mask = NDArray[np.bool_]
+
+FINE_CELLS_MAX = 4_000_000
+FINE_FACTORS = (5, 3, 1)  # of the grid that distances are measured on; odd, so that centres stay centres
+
+
+def clearance(
+    grid: Grid,
+    ground: Floats,
+    outside: Mask,
+    corners: Floats,
+    boxes: list[Box],
+    zones: tuple[Zone, ...],
+    rules: Traversability,
+) -> Floats:
+    """Signed distance [ny, nx] in m from each cell's centre to the nearest thing that stops a rover; < 0 inside it.
+
+    ``corners`` [t, 3, 3] and ``boxes`` are the obstacles that count; both are looked at, since a box is closed inside
+    and a triangle may be too small to have a box. ``outside`` [ny, nx] are cells beyond the mesh.
+    """
+    factor = next(f for f in FINE_FACTORS if f == 1 or f * f * grid.ny * grid.nx <= FINE_CELLS_MAX)
+    fine = grid.refined(factor)
+    floor = np.repeat(np.repeat(ground, factor, 0), factor, 1)
+    blocked = _touched(fine, floor, corners, rules)
+    for box in boxes:
+        window, inside = footprint(box, fine, 0.5 * fine.cell)
+        low, high = box.centre[2] - box.half[2], box.centre[2] + box.half[2]
+        height = floor[window]
+        blocked[window] |= inside & (low < height + rules.rover_height_m) & (high > height + rules.step_max_m)
+    for zone in zones:
+        blocked |= in_polygon(fine.centres, np.array(zone.polygon_m))
+    blocked |= np.repeat(np.repeat(outside, factor, 0), factor, 1)
+    framed = np.pad(blocked, 1, constant_values=True)
+    away, within = ndimage.distance_transform_edt(~framed), ndimage.distance_transform_edt(framed)
+    # Distances run between centres; the boundary lies half a cell before the first blocked centre.
+    signed = np.where(framed, 0.5 - within, away - 0.5) * fine.cell
+    return signed[1 + factor // 2 : -1 : factor, 1 + factor // 2 : -1 : factor]
+
+
+def _touched(fine: Grid, ground: Floats, corners: Floats, rules: Traversability) -> Mask:
+    """Cells in which a surface passes through the band between the step and the rover's height."""
+    blocked = np.zeros((fine.ny, fine.nx), bool)
+    for find in (faces_on, edges_on):
+        hits = find(fine, corners)
+        low, high = lowest(fine, hits, np.inf), highest(fine, hits, -np.inf)
+        blocked |= (low < ground + rules.rover_height_m) & (high > ground + rules.step_max_m)
+    return blocked
+
+
+def cost(grid: Grid, ground: Floats, clear: Floats, rules: Traversability) -> Floats:
+    """Cost [ny, nx] of driving one metre (`swarmsim.config.site.Traversability` has the formula); inf where barred."""
+    north, east = np.gradient(ground, grid.cell)
+    slope = np.hypot(north, east)
+    steepest = np.tan(np.radians(rules.slope_max_deg))
+    roughness = np.abs(ground - ndimage.uniform_filter(ground, 3, mode="nearest"))
+    near = np.clip(1.0 - clear / rules.obstacle_distance_m, 0.0, 1.0)
+    total = 1.0 + rules.slope_weight * (slope / steepest) ** 2
+    total = total + rules.roughness_weight * roughness + rules.obstacle_weight * near**2
+    return np.where((slope <= steepest) & (clear > 0.0), total, np.inf)

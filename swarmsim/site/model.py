@@ -1,0 +1,99 @@
+"""The ground truth of a place: rasters, obstacles, and the host-side model that carries its visual mesh."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmsim.config.site import SiteSpec
+from swarmsim.pytree import pytree, static
+
+
+@pytree
+class Obstacles:
+    """Yaw-oriented boxes, hollow or solid. K >= 1: a box of zero size stands in where a site has none."""
+
+    centre_m: jax.Array  # [K, 3] ENU
+    half_extent_m: jax.Array  # [K, 3] along the box's own axes (length, width, height)
+    axis: jax.Array  # [K, 2] unit vector (cos, sin of yaw): direction of the box's first axis in ENU
+    wall_m: jax.Array  # [K] thickness of the shell of a hollow box; 0 = solid
+    material: jax.Array  # [K] int32 index into Site.material_names
+
+
+@pytree
+class Site:
+    """A place as the device code sees it. Raster rows run south to north (y), columns west to east (x)."""
+
+    origin_m: jax.Array  # [2] ENU centre of cell [0, 0], the south-west one
+    cell_m: jax.Array  # [] edge length of a cell
+    terrain_m: jax.Array  # [ny, nx] height of the bare ground
+    surface_m: jax.Array  # [ny, nx] highest surface in the cell: ground, roofs, trees
+    clearance_m: jax.Array  # [ny, nx] signed distance to what stops a rover (obstacle, zone, border); < 0 inside it
+    cost: jax.Array  # [ny, nx] cost of driving one metre, >= 1; inf where a rover cannot drive
+    obstacles: Obstacles
+    survey_area_m: jax.Array  # [V, 2] ENU convex polygon, counter-clockwise
+    ground_material: jax.Array  # [] int32 index into material_names
+    material_names: tuple[str, ...] = static()  # order of the materials table
+
+
+@dataclass(frozen=True)
+class VisualMesh:
+    """What a viewer draws: triangles with vertex colours, in the site's ENU frame."""
+
+    vertices_m: NDArray[np.float32]  # [n, 3] ENU
+    triangles: NDArray[np.uint32]  # [t, 3] indices into vertices_m, counter-clockwise seen from outside
+    colours: NDArray[np.uint8]  # [n, 4] RGBA
+
+
+@dataclass(frozen=True)
+class SiteModel:
+    """A loaded site on the host: its specification, its arrays, its visual mesh and what the import found."""
+
+    name: str
+    spec: SiteSpec
+    site: Site
+    mesh: VisualMesh
+    report: dict[str, Any]  # area_m2, relief_m, obstacles, filled_cells, warnings … (plain JSON values)
+
+
+def _cell(site: Site, raster: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Values at the corners [..., 4] (SW, SE, NW, NE), place in the cell [..., 2], and whether inside [..., 2]."""
+    ny, nx = raster.shape
+    last = jnp.array([nx - 1, ny - 1], jnp.float32)
+    place = (xy - site.origin_m) / site.cell_m
+    clamped = jnp.clip(place, 0.0, last)
+    # The index is clipped after the conversion too: what a NaN converts to is undefined.
+    index = jnp.clip(clamped.astype(jnp.int32), 0, jnp.array([nx - 2, ny - 2]))
+    south_west = index[..., 1] * nx + index[..., 0]
+    corners = raster.reshape(-1).at[south_west[..., None] + jnp.array([0, 1, nx, nx + 1])].get(mode="promise_in_bounds")
+    return corners, clamped - index, (place >= 0.0) & (place <= last)
+
+
+def sample(raster: jax.Array, site: Site, xy: jax.Array) -> jax.Array:
+    """Bilinear value of a site's raster at ``xy`` [..., 2] (ENU, m), clamped at the border; [...].
+
+    ``raster`` [ny, nx] must be finite (not ``Site.cost``, whose inf would turn to NaN between cells).
+    """
+    corners, t, _ = _cell(site, raster, xy)
+    x, y = t[..., 0], t[..., 1]
+    south = corners[..., 0] + x * (corners[..., 1] - corners[..., 0])
+    north = corners[..., 2] + x * (corners[..., 3] - corners[..., 2])
+    return south + y * (north - south)
+
+
+def sample_with_gradient(raster: jax.Array, site: Site, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Bilinear value [...] at ``xy`` [..., 2] (ENU, m) and its gradient [..., 2] along x and y, per metre.
+
+    Outside the raster the value is clamped, so the gradient across the border is zero there.
+    """
+    corners, t, inside = _cell(site, raster, xy)
+    x, y = t[..., 0], t[..., 1]
+    east_south = corners[..., 1] - corners[..., 0]
+    east_north = corners[..., 3] - corners[..., 2]
+    south = corners[..., 0] + x * east_south
+    north = corners[..., 2] + x * east_north
+    slope = jnp.stack([east_south + y * (east_north - east_south), north - south], axis=-1)
+    return south + y * (north - south), jnp.where(inside, slope / site.cell_m, 0.0)

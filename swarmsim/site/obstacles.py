@@ -1,0 +1,206 @@
+"""Obstacles of a mesh as yaw-oriented boxes: connected components, split where one box would mostly hold air."""
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from swarmsim.site.raster import Floats, Grid, Integers, edge_points, faces_on
+
+FILL_MIN = 0.75  # a box whose footprint is less filled than this is split
+AREA_SMALL = 0.3  # m2; a smaller box is not split
+BOXES_PER_COMPONENT = 24
+SHEET_M = 0.01  # m; thickness of a surface whose file and specification give none
+VOLUME_SMALL, HEIGHT_SMALL = 0.1, 0.3  # m3, m; a component below both is no obstacle
+STEPPED = 0.3  # a long thing whose top varies more than this share of its height is cut in two
+POINTS_MAX = 20_000  # that stand for one component
+
+
+@dataclass(frozen=True)
+class Box:
+    """A yaw-oriented box."""
+
+    centre: tuple[float, float, float]  # m, ENU
+    half: tuple[float, float, float]  # m, along its own axes
+    axis: tuple[float, float]  # cos, sin of yaw
+    wall: float  # m; 0 = solid
+
+    @property
+    def volume(self) -> float:
+        """Volume of its outside, m3."""
+        return 8.0 * self.half[0] * self.half[1] * self.half[2]
+
+
+def components(vertices: Floats, triangles: Integers) -> list[Integers]:
+    """Indices of the triangles of each connected piece; vertices nearer than 0.1 mm are one."""
+    _, merged = np.unique(np.round(vertices, 4), axis=0, return_inverse=True)
+    corner = merged.reshape(-1)[triangles]
+    one, other = corner[:, [0, 0]].ravel(), corner[:, [1, 2]].ravel()
+    size = int(corner.max()) + 1
+    _, label = connected_components(coo_array((np.ones(len(one), bool), (one, other)), shape=(size, size)))
+    piece = label[corner[:, 0]]
+    order = np.argsort(piece, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(piece[order])) + 1)
+
+
+def boxes_of(corners: Floats, wall: float | None) -> list[Box]:
+    """Boxes that stand for one connected component with triangles ``corners`` [t, 3, 3].
+
+    ``wall`` is the thickness of its shell, None when it is solid. Components too small to matter give no box.
+    """
+    low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
+    axis = _best_axis(corners[..., :2].reshape(-1, 2), corners)
+    extent = np.append(_extent(corners[..., :2].reshape(-1, 2), axis), high[2] - low[2])
+    if extent.prod() < VOLUME_SMALL and extent[2] < HEIGHT_SMALL:
+        return []
+    points, spacing = _points(corners, float(extent[0] * extent[1]))
+    clouds: list[tuple[float, int, Floats]] = [(-extent[0] * extent[1], 0, points)]
+    done: list[Floats] = []
+    serial = 1
+    while clouds:
+        _, _, cloud = heapq.heappop(clouds)
+        room = len(done) + len(clouds) < BOXES_PER_COMPONENT - 1
+        halves = _split(cloud, spacing) if room else None
+        if halves is None:
+            done.append(cloud)
+            continue
+        for half in halves:
+            heapq.heappush(clouds, (-_extent(half[:, :2], _best_axis(half[:, :2])).prod(), serial, half))
+            serial += 1
+    # A component cut into pieces is an open shell: its pieces are the sheets themselves, and solid.
+    return [_box(cloud, wall, whole=len(done) == 1) for cloud in done]
+
+
+def _points(corners: Floats, area: float) -> tuple[Floats, float]:
+    """Points [p, 3] of the faces and edges of a component, and their spacing in m."""
+    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).sum()
+    spacing = max(0.1, (2.0 * area / POINTS_MAX) ** 0.5, 2.0 * length / POINTS_MAX)
+    low = corners[..., :2].reshape(-1, 2).min(axis=0)
+    size = np.ceil(np.ptp(corners[..., :2].reshape(-1, 2), axis=0) / spacing).astype(int) + 1
+    grid = Grid((float(low[0]), float(low[1])), spacing, int(size[1]), int(size[0]))
+    hits = faces_on(grid, corners)
+    xy = np.stack([hits.cell % grid.nx, hits.cell // grid.nx], axis=-1) * spacing + low
+    along, _ = edge_points(corners, spacing)
+    points = np.concatenate([np.column_stack([xy, hits.height]), along])
+    return np.unique(np.round(points, 4), axis=0), spacing
+
+
+def _best_axis(xy: Floats, corners: Floats | None = None) -> Floats:
+    """Direction (cos, sin) of the smallest rectangle around ``xy`` [n, 2]; its first side is the longer one.
+
+    The smallest rectangle has a side along the hull; directions are tried every degree and along the longest edges.
+    """
+    angles = np.radians(np.arange(0.0, 90.0))
+    edges = np.diff(xy, axis=0) if corners is None else (np.roll(corners, -1, 1) - corners)[..., :2].reshape(-1, 2)
+    longest = edges[np.argsort(-np.linalg.norm(edges, axis=1), kind="stable")[:32]]
+    longest = longest[np.linalg.norm(longest, axis=1) > 1e-3]
+    angles = np.unique(np.round(np.append(angles, np.arctan2(longest[:, 1], longest[:, 0]) % (np.pi / 2)), 9))
+    hull = _extreme_points(xy)
+    sides = np.stack([np.cos(angles), np.sin(angles)])
+    first = np.ptp(hull @ sides, axis=0)
+    second = np.ptp(hull @ np.stack([-sides[1], sides[0]]), axis=0)
+    best = int(np.argmin(np.round(first * second + 1e-3 * (first + second), 6)))
+    c, s = float(sides[0, best]), float(sides[1, best])
+    return np.array([c, s]) if first[best] >= second[best] else np.array([-s, c])
+
+
+def _extreme_points(xy: Floats) -> Floats:
+    """Those of ``xy`` [n, 2] that can lie on the sides of a rectangle around it (farthest in 720 directions)."""
+    if len(xy) <= 720:
+        return xy
+    angles = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
+    return xy[np.unique((xy @ np.stack([np.cos(angles), np.sin(angles)])).argmax(axis=0))]
+
+
+def _own_axes(xy: Floats, axis: Floats) -> Floats:
+    return xy @ np.array([[axis[0], -axis[1]], [axis[1], axis[0]]])
+
+
+def _extent(xy: Floats, axis: Floats) -> Floats:
+    return np.ptp(_own_axes(xy, axis), axis=0)
+
+
+def _split(cloud: Floats, spacing: float) -> tuple[Floats, Floats] | None:
+    """The cloud cut in two where that saves most area of boxes; None where one box does."""
+    axis = _best_axis(cloud[:, :2])
+    local = _own_axes(cloud[:, :2], axis)
+    extent = np.ptp(local, axis=0)
+    area = float(extent.prod())
+    if extent[0] > 4.0 * extent[1] and extent[0] > 2.0 and _stepped(local[:, 0], cloud[:, 2]):
+        left = local[:, 0] < 0.5 * (local[:, 0].min() + local[:, 0].max())
+        return cloud[left], cloud[~left]
+    if area < AREA_SMALL or extent[1] < 2.0 * spacing or _fill(local, spacing) >= FILL_MIN:
+        return None
+    saved, cut, side = max((*_best_cut(local, side), side) for side in (0, 1))
+    if saved < max(0.002 * area, 1e-3):
+        return None
+    left = local[:, side] <= cut
+    return cloud[left], cloud[~left]
+
+
+def _fill(local: Floats, spacing: float) -> float:
+    """Share of the rectangle around ``local`` [n, 2] whose cells hold points."""
+    cells = np.floor((local - local.min(axis=0)) / (1.5 * spacing)).astype(np.int64)
+    size = cells.max(axis=0) + 1
+    return len(np.unique(cells[:, 0] * size[1] + cells[:, 1])) / float(size.prod())
+
+
+def _stepped(along: Floats, height: Floats) -> bool:
+    """Whether the top of a long thing varies much along it, as a fence's down a slope."""
+    bins = np.minimum((8.0 * (along - along.min()) / np.ptp(along)).astype(np.int64), 7)
+    top, bottom = np.full(8, -np.inf), np.full(8, np.inf)
+    np.maximum.at(top, bins, height)
+    np.minimum.at(bottom, bins, height)
+    used = np.isfinite(top)
+    own = float(np.median((top - bottom)[used]))
+    return bool(np.ptp(top[used]) > STEPPED * own and np.ptp(bottom[used]) > STEPPED * own and own > 0.0)
+
+
+def _best_cut(local: Floats, side: int) -> tuple[float, float]:
+    """Area saved by cutting across ``side`` (0 or 1) into two rectangles, and the coordinate after which to cut."""
+    order = np.argsort(local[:, side], kind="stable")
+    u, v = local[order, side], local[order, 1 - side]
+    if u[-1] - u[0] <= 0.0:
+        return 0.0, 0.0
+    left = (u - u[0]) * (np.maximum.accumulate(v) - np.minimum.accumulate(v))
+    back = v[::-1]
+    right = (u[-1] - u) * (np.maximum.accumulate(back) - np.minimum.accumulate(back))[::-1]
+    whole = (u[-1] - u[0]) * np.ptp(v)
+    distinct = np.flatnonzero(np.diff(u) > 1e-6)
+    both = left[distinct] + right[distinct + 1]
+    best = int(np.argmin(both))
+    return float(whole - both[best]), float(u[distinct[best]])
+
+
+def _box(cloud: Floats, wall: float | None, whole: bool) -> Box:
+    axis = _best_axis(cloud[:, :2])
+    local = _own_axes(cloud[:, :2], axis)
+    low, high = local.min(axis=0), local.max(axis=0)
+    middle = 0.5 * (low + high)
+    half = np.append(0.5 * (high - low), 0.5 * np.ptp(cloud[:, 2]))
+    thickness = wall or SHEET_M
+    hollow = whole and wall is not None and bool((half > wall).all())
+    half = np.maximum(half, 0.5 * thickness if not hollow else 0.0)
+    x = middle[0] * axis[0] - middle[1] * axis[1]
+    y = middle[0] * axis[1] + middle[1] * axis[0]
+    z = 0.5 * (cloud[:, 2].min() + cloud[:, 2].max())
+    centre = (float(x), float(y), float(z))
+    size = (float(half[0]), float(half[1]), float(half[2]))
+    return Box(centre, size, (float(axis[0]), float(axis[1])), float(wall or 0.0) if hollow else 0.0)
+
+
+def footprint(box: Box, grid: Grid, margin: float = 0.0) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+    """A window of the grid and which of its cell centres lie in the box's footprint grown by ``margin`` m."""
+    c, s = box.axis
+    reach = np.array([abs(c) * box.half[0] + abs(s) * box.half[1], abs(s) * box.half[0] + abs(c) * box.half[1]]) + margin
+    low = np.maximum(np.floor(grid.place(np.array(box.centre[:2]) - reach)).astype(int), 0)
+    high = np.minimum(np.ceil(grid.place(np.array(box.centre[:2]) + reach)).astype(int) + 1, [grid.nx, grid.ny])
+    window = (slice(low[1], max(high[1], low[1])), slice(low[0], max(high[0], low[0])))
+    columns, rows = np.meshgrid(np.arange(window[1].start, window[1].stop), np.arange(window[0].start, window[0].stop))
+    x = grid.origin[0] + grid.cell * columns - box.centre[0]
+    y = grid.origin[1] + grid.cell * rows - box.centre[1]
+    along, across = np.abs(c * x + s * y), np.abs(c * y - s * x)
+    return window, (along <= box.half[0] + margin) & (across <= box.half[1] + margin)

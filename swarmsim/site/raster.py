@@ -1,0 +1,154 @@
+"""Triangles on a grid: where their faces cross the vertical lines of a grid, and where their edges run."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+_CHUNK = 2_000_000  # candidate points handled at once: bounds the memory
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid of square cells; ``origin`` is the centre of cell [0, 0], the south-west one."""
+
+    origin: tuple[float, float]  # m
+    cell: float  # m
+    ny: int
+    nx: int
+
+    @property
+    def centres(self) -> Floats:
+        """Centres [ny, nx, 2] of the cells."""
+        x = self.origin[0] + self.cell * np.arange(self.nx)
+        y = self.origin[1] + self.cell * np.arange(self.ny)
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    @property
+    def corners(self) -> "Grid":
+        """The grid whose points are the corners of these cells."""
+        half = 0.5 * self.cell
+        return Grid((self.origin[0] - half, self.origin[1] - half), self.cell, self.ny + 1, self.nx + 1)
+
+    def refined(self, factor: int) -> "Grid":
+        """The grid with ``factor`` (odd) x ``factor`` cells in each cell; every centre stays a centre."""
+        shift = 0.5 * self.cell * (1.0 - 1.0 / factor)
+        origin = (self.origin[0] - shift, self.origin[1] - shift)
+        return Grid(origin, self.cell / factor, self.ny * factor, self.nx * factor)
+
+    def place(self, xy: Floats) -> Floats:
+        """``xy`` [..., 2] in cells from the centre of cell [0, 0]."""
+        return (xy - np.asarray(self.origin)) / self.cell
+
+    def cell_of(self, xy: Floats) -> Integers:
+        """Flat index [...] of the cell that ``xy`` [..., 2] lies in; the border cell for points outside."""
+        column, row = np.moveaxis(np.rint(self.place(xy)).astype(np.int64), -1, 0)
+        return np.clip(row, 0, self.ny - 1) * self.nx + np.clip(column, 0, self.nx - 1)
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Points of surfaces on a grid."""
+
+    cell: Integers  # [h] flat index of the grid point
+    height: Floats  # [h] m
+    triangle: Integers  # [h] index of the triangle
+
+
+def faces_on(grid: Grid, corners: Floats) -> Hits:
+    """Where the vertical lines through the grid's points meet the triangles ``corners`` [t, 3, 3] (edges included)."""
+    found = list(_faces(grid, corners))
+    if not found:
+        nothing = np.empty(0, np.int64)
+        return Hits(nothing, np.empty(0), nothing)
+    return Hits(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+
+
+def _faces(grid: Grid, corners: Floats) -> Iterator[tuple[Integers, Floats, Integers]]:
+    points = grid.place(corners[..., :2])
+    size = np.array([grid.nx, grid.ny])
+    tolerance = 1e-6
+    low = np.clip(np.ceil(points.min(axis=1) - tolerance).astype(np.int64), 0, size)
+    high = np.clip(np.floor(points.max(axis=1) + tolerance).astype(np.int64), -1, size - 1)
+    span = np.maximum(high - low + 1, 0)
+    count = span.prod(axis=1)
+    first, second = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+    doubled_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    chosen = np.flatnonzero((count > 0) & (np.abs(doubled_area) > 1e-9))
+    for part in _chunks(chosen, count):
+        triangle = np.repeat(part, count[part])
+        within = np.arange(len(triangle)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
+        column = low[triangle, 0] + within % span[triangle, 0]
+        row = low[triangle, 1] + within // span[triangle, 0]
+        offset = np.stack([column, row], axis=-1) - points[triangle, 0]
+        u = (offset[:, 0] * second[triangle, 1] - offset[:, 1] * second[triangle, 0]) / doubled_area[triangle]
+        v = (first[triangle, 0] * offset[:, 1] - first[triangle, 1] * offset[:, 0]) / doubled_area[triangle]
+        hit = (u >= -tolerance) & (v >= -tolerance) & (u + v <= 1.0 + tolerance)
+        triangle, u, v = triangle[hit], u[hit], v[hit]
+        z = corners[triangle, :, 2]
+        yield (row * grid.nx + column)[hit], z[:, 0] + u * (z[:, 1] - z[:, 0]) + v * (z[:, 2] - z[:, 0]), triangle
+
+
+def _chunks(chosen: Integers, count: Integers) -> Iterator[Integers]:
+    if len(chosen):
+        edges = np.flatnonzero(np.diff(np.cumsum(count[chosen]) // _CHUNK)) + 1
+        yield from np.split(chosen, edges)
+
+
+def edges_on(grid: Grid, corners: Floats) -> Hits:
+    """The cells that the edges of the triangles ``corners`` [t, 3, 3] run through, sampled every quarter of a cell."""
+    points, triangle = edge_points(corners, 0.25 * grid.cell)
+    place = grid.place(points[:, :2])
+    inside = ((place > -0.5 - 1e-6) & (place < np.array([grid.nx, grid.ny]) - 0.5 + 1e-6)).all(axis=1)
+    return Hits(grid.cell_of(points[inside, :2]), points[inside, 2], triangle[inside])
+
+
+def edge_points(corners: Floats, spacing: float) -> tuple[Floats, Integers]:
+    """Points [p, 3] along the edges of triangles [t, 3, 3], ends included, and the triangle [p] of each."""
+    start = corners.reshape(-1, 3)
+    step = np.roll(corners, -1, axis=1).reshape(-1, 3) - start
+    pieces = np.maximum(np.ceil(np.linalg.norm(step, axis=1) / spacing).astype(np.int64), 1)
+    edge = np.repeat(np.arange(len(start)), pieces + 1)
+    within = np.arange(len(edge)) - np.repeat(np.cumsum(pieces + 1) - pieces - 1, pieces + 1)
+    return start[edge] + (within / pieces[edge])[:, None] * step[edge], edge // 3
+
+
+def highest(grid: Grid, hits: Hits, empty: float = np.nan) -> Floats:
+    """Highest hit of each cell [ny, nx]; ``empty`` where there is none."""
+    return _extreme(grid, hits, empty, -np.inf, np.maximum)
+
+
+def lowest(grid: Grid, hits: Hits, empty: float = np.nan) -> Floats:
+    """Lowest hit of each cell [ny, nx]; ``empty`` where there is none."""
+    return _extreme(grid, hits, empty, np.inf, np.minimum)
+
+
+def _extreme(grid: Grid, hits: Hits, empty: float, start: float, pick: np.ufunc) -> Floats:
+    flat = np.full(grid.ny * grid.nx, start)
+    pick.at(flat, hits.cell, hits.height)
+    return np.where(np.isinf(flat), empty, flat).reshape(grid.ny, grid.nx)
+
+
+def top_of_cells(grid: Grid, corners: Floats, empty: float = np.nan) -> Floats:
+    """Highest point of triangles [t, 3, 3] within each whole cell [ny, nx].
+
+    A plane within a cell is highest at a corner of the cell or on an edge of the triangle, so both are looked at.
+    """
+    at_corners = highest(grid.corners, faces_on(grid.corners, corners), -np.inf)
+    top = np.maximum.reduce([at_corners[:-1, :-1], at_corners[:-1, 1:], at_corners[1:, :-1], at_corners[1:, 1:]])
+    top = np.maximum(top, highest(grid, edges_on(grid, corners), -np.inf))
+    return np.where(np.isinf(top), empty, top)
+
+
+def in_polygon(points: Floats, polygon: Floats) -> NDArray[np.bool_]:
+    """Whether each of ``points`` [..., 2] lies in ``polygon`` [v, 2] (even-odd rule)."""
+    inside = np.zeros(points.shape[:-1], bool)
+    x, y = points[..., 0], points[..., 1]
+    for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        if ay != by:
+            inside ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) * (bx - ax) / (by - ay))
+    return inside

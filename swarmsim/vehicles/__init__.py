@@ -1,0 +1,1 @@
+"""What a vehicle is: its parameters, its body, its rotors and wheels."""

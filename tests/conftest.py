@@ -1,0 +1,16 @@
+"""Settings of the whole suite: CPU, a compilation cache of its own, deterministic hypothesis."""
+
+import os
+import tempfile
+from pathlib import Path
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("MPLBACKEND", "Agg")
+_CACHE = Path(os.environ.get("SWARMSIM_TEST_CACHE", Path(tempfile.gettempdir()) / "swarmsim-test-cache"))
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+
+from hypothesis import settings  # noqa: E402 - the environment is set first
+
+settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=25)
+settings.load_profile("deterministic")
