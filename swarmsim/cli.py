@@ -1,7 +1,9 @@
 """The commands: thin, and quick to start. What they need is imported when they run."""
 
+import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -28,38 +30,43 @@ def _version() -> str:
 
 app = App(
     name="swarmsim",
-    help=(
-        "Simulate teams of aerial and ground robots that search for radioactive sources.\n\n"
+    help="Simulate teams of aerial and ground robots that search for radioactive sources.",
+    help_epilogue=(
         "Examples:\n"
-        "    swarmsim run recon               fly the shipped mission, results in runs/recon\n"
-        "    swarmsim view runs/recon         watch it in the Rerun viewer\n"
-        "    swarmsim init my_project         copy the configurations out, to edit them\n"
-        "    swarmsim list vehicles           what there is to build a team of\n\n"
-        "Exit codes: 0 done, 2 wrong input (said on standard error), 130 stopped with Ctrl-C."
+        "    swarmsim run recon           fly the shipped mission, results in runs/recon\n"
+        "    swarmsim view runs/recon     watch it in the Rerun viewer\n"
+        "    swarmsim init my_project     copy the configurations out, to edit them\n"
+        "    swarmsim list vehicles       what there is to build a team of\n\n"
+        "'swarmsim COMMAND --help' says more of a command, with examples.\n"
+        "Exit codes: 0 done, 2 wrong input (told on standard error), 130 stopped with Ctrl-C."
     ),
     version=_version,
     help_format="plaintext",
     suppress_keyboard_interrupt=False,
+    default_parameter=Parameter(show_default=False, negative=""),
 )
 
 
-@app.command
+command = partial(app.command, help_epilogue="")  # the epilogue above is that of the whole program
+
+
+@command
 def run(
     scenario: str,
     *,
     out: Path | None = None,
     seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END))] = None,
     missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1_000_000))] = 1,
-    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False, negative="")] = (),
-    force: Annotated[bool, Parameter(negative="")] = False,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    force: bool = False,
 ) -> None:
     """Fly a mission, or many at once, and write the results.
 
-    Examples:
+    For example:
         swarmsim run recon
         swarmsim run configs/missions/recon.yaml --seed 7 --out runs/seven
         swarmsim run recon --missions 256
-        swarmsim run recon --set aerial.altitude_m=30 --set sources.0.activity_mbq=50
+        swarmsim run recon --set aerial.altitude_m=30 --set wind.speed_m_s=5
         swarmsim run runs/recon/scenario.yaml --out runs/again
 
     Parameters
@@ -71,7 +78,7 @@ def run(
     seed
         Seed of the (first) mission, instead of the one in the file.
     missions
-        How many missions to fly in one batch, with seeds N, N+1, …
+        How many missions to fly in one batch, with seeds N, N+1, …; 1 by default.
     overrides
         Change a value of the mission, as path=value; may be given again and again. Items of a list are named by
         index or by their name, e.g. vehicles.uav1.heading_deg=90.
@@ -83,11 +90,11 @@ def run(
     run_scenario(scenario, out, seed, missions, overrides, force)
 
 
-@app.command
-def view(run: Path, *, web: Annotated[bool, Parameter(negative="")] = False) -> None:
+@command
+def view(run: Path, *, web: bool = False) -> None:
     """Open the recording of a run in the Rerun viewer.
 
-    Examples:
+    For example:
         swarmsim view runs/recon
         swarmsim view runs/recon --web
 
@@ -103,11 +110,11 @@ def view(run: Path, *, web: Annotated[bool, Parameter(negative="")] = False) -> 
     view_run(run, web)
 
 
-@app.command
+@command
 def check(*paths: Path) -> None:
     """Validate configuration files of any kind, and tell everything that is wrong with them.
 
-    Examples:
+    For example:
         swarmsim check configs/missions/recon.yaml
         swarmsim check my_vehicle.yaml configs/nuclides/*.yaml
         swarmsim check configs
@@ -123,29 +130,29 @@ def check(*paths: Path) -> None:
     check_files(paths)
 
 
-@app.command
+@command
 def schema(kind: ModelKind = "mission") -> None:
     """Print the JSON schema of a kind of configuration file, e.g. for an editor's completion.
 
-    Examples:
+    For example:
         swarmsim schema
         swarmsim schema vehicle > vehicle.schema.json
 
     Parameters
     ----------
     kind
-        Which configuration file.
+        Which configuration file; mission by default.
     """
     from swarmsim.cli_files import print_schema
 
     print_schema(kind)
 
 
-@app.command(name="list")
+@command(name="list")
 def list_(kind: Kind | None = None) -> None:
     """List what is available: vehicles, sites, missions, detectors, nuclides, materials and policies.
 
-    Examples:
+    For example:
         swarmsim list
         swarmsim list nuclides
 
@@ -159,11 +166,11 @@ def list_(kind: Kind | None = None) -> None:
     list_available(kind)
 
 
-@app.command
+@command
 def init(folder: Path) -> None:
     """Copy the shipped configurations to FOLDER/configs, to be edited; names found there come before the shipped ones.
 
-    Examples:
+    For example:
         swarmsim init .
         swarmsim init my_project && cd my_project && swarmsim run recon
 
@@ -177,7 +184,7 @@ def init(folder: Path) -> None:
     copy_configurations(folder)
 
 
-@app.command
+@command
 def import_site(
     file: Path,
     *,
@@ -186,14 +193,16 @@ def import_site(
     unit: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
     up: Literal["X", "Y", "Z"] | None = None,
     cell: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
-    ground: Annotated[tuple[str, ...], Parameter(consume_multiple=False, negative="")] = (),
-    force: Annotated[bool, Parameter(negative="")] = False,
+    ground: Annotated[tuple[str, ...], Parameter(consume_multiple=False)] = (),
+    licence: str | None = None,
+    force: bool = False,
 ) -> None:
     """Turn a mesh (.dae, .obj, .glb, .stl) or an elevation model (GeoTIFF) into a site.
 
-    Examples:
+    For example:
         swarmsim import-site farm.dae --out configs/sites/farm
-        swarmsim import-site yard.obj --out configs/sites/yard --unit 0.01 --up Y --ground 'terrain*'
+        swarmsim import-site yard.obj --out configs/sites/yard --unit 0.01 --up Y
+        swarmsim import-site yard.glb --out configs/sites/yard --ground 'terrain*'
         swarmsim import-site alps.tif --out configs/sites/alps --cell 2
 
     Parameters
@@ -212,12 +221,14 @@ def import_site(
         Size of the cells of the height maps, in metres.
     ground
         Pattern of the materials or geometries that are bare ground; may be given again and again.
+    licence
+        Licence of the file, to be written into the site.
     force
         Replace an existing site.
     """
     from swarmsim.cli_files import import_site_file
 
-    import_site_file(file, out, name, unit, up, cell, ground, force)
+    import_site_file(file, out, name, unit, up, cell, ground, licence, force)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -238,6 +249,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         sys.stderr.write(f"{describe(error)}\n")
         return EXIT_INPUT
+    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         sys.stderr.write("\nstopped with Ctrl-C: nothing unfinished was left behind\n")
         return EXIT_INTERRUPTED

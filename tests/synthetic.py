@@ -82,13 +82,48 @@ def _mesh(step_m: float) -> VisualMesh:
     x, y = np.meshgrid(np.linspace(WEST, WEST + WIDTH, columns), np.linspace(SOUTH, SOUTH + DEPTH, rows))
     vertices = [np.stack([x, y, ground(x, y)], -1).reshape(-1, 3)]
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1, 1)
-    triangles = [np.r_[corner + [0, 1, columns + 1], corner + [0, columns + 1, columns]]]
+    triangles = [(corner + np.array([[0, 1, columns + 1, 0, columns + 1, columns]])).reshape(-1, 3)]
     speckle = np.random.default_rng(0).integers(-8, 8, (rows * columns, 1))
     colours = [np.c_[np.array([118, 128, 96]) + speckle, np.full(rows * columns, 255)]]
-    faces = np.array(
-        [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4]]
-        + [[1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]]
-    )
+    around = [
+        0,
+        2,
+        1,
+        0,
+        3,
+        2,
+        4,
+        5,
+        6,
+        4,
+        6,
+        7,
+        0,
+        1,
+        5,
+        0,
+        5,
+        4,
+        1,
+        2,
+        6,
+        1,
+        6,
+        5,
+        2,
+        3,
+        7,
+        2,
+        7,
+        6,
+        3,
+        0,
+        4,
+        3,
+        4,
+        7,
+    ]
+    faces = np.reshape(around, (-1, 3))
     signs = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
     for cx, cy, length, width, height in BUILDINGS:
         base = ground(np.array(cx), np.array(cy))
@@ -148,18 +183,17 @@ ROVER = Shape(
 )
 
 
-def _vehicle(name: str, kind: str, points: np.ndarray, speed: float, start_s: float, time_s: np.ndarray) -> VehicleRecord:
+def _vehicle(
+    name: str, kind: str, points: np.ndarray, speed: float, start_s: float, time_s: np.ndarray
+) -> VehicleRecord:
     position = _follow(points, speed, start_s, time_s)
     if kind == "skid_steer":
         position[:, 2] += 0.2
     velocity = np.gradient(position, time_s, axis=0)
     yaw = np.unwrap(np.arctan2(velocity[:, 1], np.where(np.abs(velocity[:, 0]) < 1e-6, 1e-6, velocity[:, 0])))
     tilt = 0.06 * (np.linalg.norm(velocity[:, :2], axis=1) > 0.1) * (kind == "multirotor")
-    quaternion = np.stack(
-        [np.cos(yaw / 2) * np.cos(tilt / 2), -np.sin(yaw / 2) * np.sin(tilt / 2), np.cos(yaw / 2) * np.sin(tilt / 2)]
-        + [np.sin(yaw / 2) * np.cos(tilt / 2)],
-        -1,
-    )
+    cy, sy, ct, st = np.cos(yaw / 2), np.sin(yaw / 2), np.cos(tilt / 2), np.sin(tilt / 2)
+    quaternion = np.stack([cy * ct, -sy * st, cy * st, sy * ct], -1)
     used = (time_s - time_s[0]) * (350.0 if kind == "multirotor" else 60.0) / 3600.0
     return VehicleRecord(
         name=name,
@@ -241,7 +275,7 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
     samples = _samples(vehicles, aerial_end, sample_hz, ACTIVITY_MBQ if found else 0.0, rng)
     phases = (Phase("aerial", 0.0, aerial_end),)
     estimate = Estimate(
-        position_m=SOURCE_M + [0.12, -0.09, 0.2],
+        position_m=SOURCE_M + np.array([0.12, -0.09, 0.2]),
         covariance_m2=np.array([[0.020, 0.006, 0.0], [0.006, 0.012, 0.0], [0.0, 0.0, 0.09]]),
         activity_mbq=166.0,
         activity_std_mbq=3.1,
@@ -250,7 +284,7 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
     )
     aerial = dataclasses.replace(
         estimate,
-        position_m=SOURCE_M + [0.9, -0.6, -0.5],
+        position_m=SOURCE_M + np.array([0.9, -0.6, -0.5]),
         covariance_m2=np.array([[1.9, 0.4, 0.0], [0.4, 1.6, 0.0], [0.0, 0.0, 0.25]]),
         activity_mbq=161.0,
         activity_std_mbq=9.0,

@@ -18,7 +18,7 @@ class Shape:
         self._root: Schema = TypeAdapter(cls).json_schema()
 
     def at(self, place: Place, data: Any) -> Schema | None:
-        """Schema of the value at ``place``; None where nothing may stand. ``data`` tells which of several models holds."""
+        """Schema of the value at ``place``; None where nothing may stand. ``data`` tells which model of a union."""
         schema, value = self._resolve(self._root, data), data
         for step in place:
             inner = self._step(schema, step)
@@ -47,6 +47,9 @@ class Shape:
         if step in schema.get("properties", {}):
             inner: Schema = schema["properties"][step]
             return inner
+        for named in schema.get("patternProperties", {}).values():
+            found: Schema = named
+            return found
         extra = schema.get("additionalProperties")
         if isinstance(extra, dict):
             return extra
@@ -92,8 +95,10 @@ class Shape:
 
     def _list_words(self, schema: Schema) -> str:
         if "prefixItems" in schema:
-            items = [self._words(item) for item in schema["prefixItems"]]
-            return f"a list of {len(items)} values, each {items[0]}" if len(set(items)) == 1 else f"[{', '.join(items)}]"
+            items = [self._words(inner) for inner in schema["prefixItems"]]
+            if len(set(items)) == 1:
+                return f"a list of {len(items)} values, each {items[0]}"
+            return f"[{', '.join(items)}]"
         low, high = schema.get("minItems"), schema.get("maxItems")
         count = f" of {low} to {high}" if low and high else f" of at least {low}" if low else ""
         count = f" of at most {high}" if high and not low else count

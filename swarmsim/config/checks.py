@@ -73,7 +73,7 @@ def check_detectors(mission: Mission, vehicles: Vehicles, document: Document, ne
     for i, (member, vehicle) in enumerate(zip(mission.vehicles, vehicles, strict=True)):
         place: Place = ("vehicles", i, "type")
         if vehicle.detector is None:
-            message = f"the vehicle type '{member.type}' carries no detector, and every vehicle of the team must measure"
+            message = f"the vehicle type '{member.type}' carries no detector, and every vehicle must measure"
             hint = "give its file a 'detector', or choose another type"
             problems.append(document.problem(place, message, given=member.type, suggestion=hint))
         elif (name := vehicle.detector.model) not in known:
@@ -108,9 +108,10 @@ def footprint_radius_m(vehicle: Multirotor | SkidSteer) -> float:
         return vehicle.collision_radius_m
     length, width = vehicle.chassis_size_m[:2]
     wheels = vehicle.wheels
-    return math.hypot(
-        max(length, wheels.wheel_base_m + 2 * wheels.radius_m), max(width, wheels.track_m + wheels.width_m)
-    ) / 2
+    return (
+        math.hypot(max(length, wheels.wheel_base_m + 2 * wheels.radius_m), max(width, wheels.track_m + wheels.width_m))
+        / 2
+    )
 
 
 def _indices(value: Any) -> range:

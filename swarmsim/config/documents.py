@@ -1,7 +1,7 @@
 """YAML read into plain data that remembers the file and line of each value.
 
-Scalars follow the YAML 1.2 core schema: only ``true`` and ``false`` are booleans (``yes``, ``on`` are words), ``1e3`` is
-a number, ``010`` is ten and ``1:30`` is a word, so that no number changes behind a user's back.
+Scalars follow the YAML 1.2 core schema: only ``true`` and ``false`` are booleans (``yes``, ``on`` are words), ``1e3``
+is a number, ``010`` is ten and ``1:30`` is a word, so that no number changes behind a user's back.
 """
 
 import re
@@ -155,6 +155,8 @@ def parse_value(text: str) -> Any:
 def _compose(text: str, file: str) -> yaml.Node | None:
     try:
         return yaml.compose(text, Loader=_Loader)
+    except RecursionError as error:
+        raise InputError.of("is nested too deeply", file=file, allowed="a few levels of fields and lists") from error
     except yaml.reader.ReaderError as error:
         line = text[: error.position].count("\n") + 1
         raise InputError.of(
@@ -172,8 +174,8 @@ def _compose(text: str, file: str) -> yaml.Node | None:
             what, hint = "holds more than one document", "remove what follows the line '---'"
         elif what.startswith(("expected", "could not find expected")):
             hint = "look for an unclosed bracket or quote, a missing ':' or wrong indentation on this line or above it"
-        line = None if mark is None else mark.line + 1
-        raise InputError.of(f"is not valid YAML: {what}", file=file, line=line, suggestion=hint) from error
+        at = None if mark is None else mark.line + 1
+        raise InputError.of(f"is not valid YAML: {what}", file=file, line=at, suggestion=hint) from error
 
 
 def _line(node: yaml.Node) -> int:
@@ -208,7 +210,8 @@ class _Builder:
     def _entries(self, node: yaml.MappingNode, place: Place) -> Iterator[tuple[str, yaml.Node, int]]:
         first: dict[str, int] = {}
         for key_node, value_node in node.value:
-            key, line = key_node.value, _line(key_node)
+            key: str = key_node.value
+            line = _line(key_node)
             if not isinstance(key_node, yaml.ScalarNode) or key_node.tag == _TAG + "null":
                 self._problem(key_node, place, "a field's name must be a word")
             elif key in first:

@@ -10,8 +10,8 @@ from typing import Any
 class Problem:
     """One thing that is wrong, where it stands and how to mend it.
 
-    ``file`` is the path of the file (or ``--set`` for an override), ``line`` counts from 1, ``path`` is the dotted place
-    of the value inside the file, ``given`` is what stands there, ``allowed`` says what may stand there, and
+    ``file`` is the path of the file (or ``--set`` for an override), ``line`` counts from 1, ``path`` is the dotted
+    place of the value inside the file, ``given`` is what stands there, ``allowed`` says what may stand there, and
     ``suggestion`` is the nearest valid name or a hint.
     """
 
@@ -39,7 +39,7 @@ class Problem:
 
 
 class InputError(Exception):
-    """What a user gave cannot be used. ``problems`` holds every reason; the command line prints them and exits with 2."""
+    """What a user gave cannot be used; ``problems`` holds every reason (the command line prints them, exit code 2)."""
 
     def __init__(self, problems: Iterable[Problem]):
         """Hold ``problems`` (at least one)."""

@@ -19,13 +19,14 @@ def packaged_dir() -> Path:
 def config_dirs(near: Path | None = None) -> list[Path]:
     """Folders that are searched, first come first served.
 
-    They are the ``configs`` folder that the file ``near`` lies in (the parent of its ``missions``, ``vehicles`` …), the
-    ``configs`` of the working folder, and the packaged ones.
+    They are the ``configs`` folder that the file ``near`` lies in (the parent of its ``missions``, ``vehicles`` …)
+    unless it is the packaged one, the ``configs`` of the working folder, and the packaged ones.
     """
     found: list[Path] = []
     if near is not None:
         parents = near.absolute().parents
         found += [parents[i + 1] for i in range(min(2, len(parents) - 1)) if parents[i].name in KINDS]
+        found = [folder for folder in found if folder.resolve() != packaged_dir()]
     found += [folder for folder in (Path.cwd() / "configs", packaged_dir()) if folder.is_dir()]
     unique: dict[Path, Path] = {}
     for folder in found:

@@ -70,9 +70,9 @@ class _Ground:
         column, row = np.clip(((xy - self.low) / self.cell).astype(int), 0, [columns - 1, rows - 1])
         return float(raster[row, column])
 
-    def inside(self, points: Floats) -> NDArray[np.bool_]:
-        """Which boxes hold the point [3], as distances within their faces; [K, 3] each box's own axes."""
-        offset = points - self.centre
+    def depth(self, point: Floats) -> Floats:
+        """How deep a point [3] lies within each box, along the box's own axes [K, 3]; < 0 outside."""
+        offset = point - self.centre
         along = offset[:, 0] * self.axis[:, 0] + offset[:, 1] * self.axis[:, 1]
         across = -offset[:, 0] * self.axis[:, 1] + offset[:, 1] * self.axis[:, 0]
         depth: Floats = self.half - np.abs(np.stack([along, across, offset[:, 2]], axis=1))
@@ -86,7 +86,7 @@ def _check_sources(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
         if not ground.holds(xy):
             yield scenario.problem(place, "the source lies outside the site", given=given, allowed=ground.extent)
             continue
-        depth = ground.inside(np.array([*xy, ground.cell_value(ground.terrain, xy) + source.height_m]))
+        depth = ground.depth(np.array([*xy, ground.cell_value(ground.terrain, xy) + source.height_m]))
         within = np.all(depth > 0, axis=1)
         in_cavity = (ground.wall > 0) & np.all(depth >= ground.wall[:, None], axis=1)
         blocked = np.flatnonzero(within & ~in_cavity & ~ground.porous)
@@ -113,7 +113,7 @@ def _check_vehicles(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
             yield scenario.problem(place, message, given=given, allowed=ground.extent)
             continue
         height = vehicle.chassis_height_m if isinstance(vehicle, SkidSteer) else vehicle.collision_height_m
-        depth = ground.inside(np.array([*xy, ground.cell_value(ground.terrain, xy) + height / 2]))
+        depth = ground.depth(np.array([*xy, ground.cell_value(ground.terrain, xy) + height / 2]))
         touching = np.flatnonzero((depth[:, :2].min(axis=1) > -radius) & (depth[:, 2] > -height / 2))
         touching = touching[np.all(ground.half[touching] > 0, axis=1)]
         if touching.size:
@@ -126,7 +126,7 @@ def _check_vehicles(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
                 suggestion=f"the obstacle's centre is at {_point(ground.centre[k, :2])}",
             )
         elif isinstance(vehicle, SkidSteer) and ground.cell_value(ground.clearance, xy) <= 0:
-            message = f"'{member.name}' starts where a rover cannot drive (an obstacle, a closed zone or the site's edge)"
+            message = f"'{member.name}' starts where a rover cannot drive (obstacle, closed zone or edge of the site)"
             yield scenario.problem(place, message, given=given, allowed="traversable ground")
 
 

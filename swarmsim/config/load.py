@@ -8,7 +8,7 @@ from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS, kind_of_model
 from swarmsim.config.documents import Document, read_file
-from swarmsim.config.errors import InputError
+from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.names import did_you_mean
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.validation import validate
@@ -58,7 +58,7 @@ def _with_body(vehicle: Any, path: Path, document: Document) -> Any:
 def load_all(kind: str, near: Path | None = None) -> dict[str, Any]:
     """Every configuration of a kind by its name, in the order of the names; raises with the problems of all of them."""
     models: dict[str, Any] = {}
-    problems = []
+    problems: list[Problem] = []
     for name, path in files.available(kind, near).items():
         try:
             models[name] = load_named(kind, path, near)

@@ -72,7 +72,7 @@ class Localisation(Model):
     starts: int = Field(ge=1, le=64)
     iterations: int = Field(ge=10, le=10_000)
     learning_rate_m: Positive
-    fisher_steps: int = Field(default=8, ge=1, le=100)
+    fisher_steps: int = Field(default=6, ge=1, le=100)
 
 
 class Ground(Model):

@@ -44,10 +44,9 @@ def _apply(document: Document, text: str, shape: Shape) -> None:
         place = (*place, known)
         if i == len(steps) - 1:
             node[known] = value
-        elif isinstance(node, list) or isinstance(node.get(known), dict | list):
-            node = node[known]
         else:
-            node[known] = {}
+            if isinstance(node, dict) and node.get(known) is None:
+                node[known] = {}
             node = node[known]
     document.replace(place, {place: Mark(ORIGIN, None)})
 
@@ -76,5 +75,5 @@ def _known_step(node: Any, step: str, place: Place, document: Document, shape: S
     raise InputError([_at((*place, step), f"{here} is a single value and has nothing inside")])
 
 
-def _at(place: Place, message: str, **details: str | None) -> Problem:
+def _at(place: Place, message: str, **details: Any) -> Problem:
     return Problem(message=message, file=ORIGIN, path=dotted(place), **details)

@@ -16,7 +16,7 @@ from swarmsim.config.documents import Document, Place, dump_yaml
 from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.load import load_named, read_document
 from swarmsim.config.mission import Mission
-from swarmsim.config.overrides import apply_overrides
+from swarmsim.config.overrides import ORIGIN, apply_overrides
 from swarmsim.config.radiation import Detector, Material, Nuclide
 from swarmsim.config.site import SiteSpec
 from swarmsim.config.validation import validate
@@ -43,15 +43,13 @@ class Scenario:
         return self.document.problem(place, message, **details)
 
     def to_yaml(self) -> str:
-        """The scenario fully resolved: every default, vehicle, detector, nuclide and material written out, and versions.
+        """The scenario fully resolved: every default, vehicle, detector, nuclide and material written out.
 
         `load_scenario` reads it back to the same mission. The site stays a name; the hash of its files is among the
-        versions (``site_sha256``).
+        ``versions`` (``site_sha256``).
         """
         data = self.mission.model_dump(mode="json", exclude_none=True)
-        types = {
-            member.type: vehicle for member, vehicle in zip(self.mission.vehicles, self.vehicles, strict=True)
-        }
+        types = {member.type: vehicle for member, vehicle in zip(self.mission.vehicles, self.vehicles, strict=True)}
         libraries: dict[str, Mapping[str, Any]] = {
             "vehicles": types,
             "detectors": self.detectors,
@@ -111,7 +109,7 @@ def _resolve(document: Document, near: Path | None, problems: list[Problem]) -> 
         problems += error.problems
     at_fault = {problem.path for problem in problems}
     problems += [problem for problem in check_references(document, near) if problem.path not in at_fault]
-    raise_if_any(problems)
+    raise_if_any(sorted(problems, key=lambda p: (p.file != ORIGIN, p.file or "", p.line or 0)))
     assert mission is not None
     found = _look_up(mission, document, near)
     raise_if_any(check_consistency(mission, found.vehicles, found.detectors, found.materials, found.site, document))

@@ -46,7 +46,7 @@ def problems_of(error: ValidationError, document: Document, cls: Any) -> list[Pr
     shape = shape_of(cls)
     found: dict[Place, Problem] = {}
     for details in error.errors(include_url=False):
-        place = _place(details["loc"], document.data)
+        place = _place(details, document.data)
         if details["type"] == "too_short" and any(p[: len(place)] == place and p != place for p in found):
             continue  # pydantic counts only the items that passed: the items' own problems say more
         if isinstance(place[-1] if place else None, int) and details["type"] == "missing":
@@ -55,12 +55,13 @@ def problems_of(error: ValidationError, document: Document, cls: Any) -> list[Pr
     return sorted(found.values(), key=lambda problem: problem.line or 0)
 
 
-def _place(loc: tuple[str | int, ...], data: Any) -> Place:
+def _place(details: ErrorDetails, data: Any) -> Place:
     """The place that pydantic's ``loc`` means: without the names of the union's members, which it puts in between."""
+    loc, missing = details["loc"], details["type"] == "missing"
     place: list[str | int] = []
     for i, step in enumerate(loc):
         inside = isinstance(data, dict) if isinstance(step, str) else isinstance(data, list)
-        if inside and (isinstance(step, int) or step in data or i == len(loc) - 1):
+        if inside and (isinstance(step, int) or step in data or (missing and i == len(loc) - 1)):
             place.append(step)
             data = item(data, step)
     return tuple(place)
@@ -74,7 +75,7 @@ def _problem(details: ErrorDetails, place: Place, document: Document, shape: Sha
         return document.problem(
             place, f"there is no field '{name}' here", allowed=one_of(fields), suggestion=did_you_mean(name, fields)
         )
-    given = shown(details["input"])
+    given = None if kind == "value_error" and isinstance(details["input"], dict) else shown(details["input"])
     allowed = shape.describe(place, data)
     if kind == "missing" and isinstance(details["loc"][-1], str):
         return document.problem(place, "this field is missing", allowed=allowed)
@@ -90,7 +91,7 @@ def _problem(details: ErrorDetails, place: Place, document: Document, shape: Sha
             suggestion=did_you_mean(value, tags or ()) if value else None,
         )
     choices = _choices(allowed)
-    suggestion = did_you_mean(given, choices) if kind in ("literal_error", "enum") else _hint(details["input"], kind)
+    suggestion = did_you_mean(given, choices) if given and kind == "literal_error" else _hint(details["input"], kind)
     return document.problem(place, _message(details), given=given, allowed=allowed, suggestion=suggestion)
 
 

@@ -55,7 +55,7 @@ class Sourced(Model):
 
 
 class BodyFile(Model):
-    """A URDF, xacro or MJCF file that gives the body (mass, inertia, visual geometry), with its xacro arguments."""
+    """A URDF or xacro file that gives the body (mass, inertia, visual geometry), with its xacro arguments."""
 
     file: str
     args: dict[str, str | float | int | bool] = Field(default_factory=dict)
@@ -163,7 +163,10 @@ class Multirotor(Sourced):
 
 
 class Wheels(Model):
-    """Four driven wheels: radius, mass, spacing and friction with the ground."""
+    """Four driven wheels: radius, mass, spacing and friction with the ground.
+
+    ``stiffness_n_m`` is load over sinkage of one tyre, ``damping_ratio`` that of the rover bouncing on its four tyres.
+    """
 
     radius_m: Positive
     width_m: Positive
@@ -172,6 +175,8 @@ class Wheels(Model):
     track_m: Positive
     friction: Positive
     rolling_resistance: NonNegative
+    stiffness_n_m: Positive
+    damping_ratio: Positive
 
 
 class WheelMotor(Model):

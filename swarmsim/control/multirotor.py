@@ -15,6 +15,14 @@ from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
 
 LIFT_MIN = 0.2
 """Least vertical part of the commanded thrust over the weight: below it the thrust's direction means nothing."""
+LANDED_AFTER_S = 0.4
+"""How long the ground must stop a commanded descent before the vehicle counts as landed."""
+LANDED_LOAD = 0.02
+"""Load on the landing gear, over the weight, from which it feels the ground."""
+LANDED_DESCENT_M_S = 0.2
+"""Commanded descent that a flying vehicle would follow."""
+LANDED_SPEED_M_S = 0.15
+"""Speed below which it does not."""
 
 
 @pytree
@@ -32,11 +40,19 @@ class ControlMemory:
     """What the controller carries from call to call."""
 
     integral_m_s2: jax.Array  # [3] m/s^2, world: acceleration that holds against wind, payload and model error
+    stuck_s: jax.Array  # [] s for which the ground has stopped a commanded descent: landed from LANDED_AFTER_S on
 
 
-def control_start() -> ControlMemory:
-    """Memory of a controller that has not run yet."""
-    return ControlMemory(integral_m_s2=jnp.zeros(3))
+def control_start(*, landed: bool = False) -> ControlMemory:
+    """Memory of a controller that has not run yet; ``landed`` leaves the motors off until a climb is commanded."""
+    return ControlMemory(
+        integral_m_s2=jnp.zeros(3), stuck_s=jnp.asarray(LANDED_AFTER_S if landed else 0.0, jnp.float32)
+    )
+
+
+def is_landed(memory: ControlMemory) -> jax.Array:
+    """Whether [] the controller holds the vehicle for landed and has switched the motors off."""
+    return memory.stuck_s >= LANDED_AFTER_S
 
 
 def control(
@@ -44,10 +60,12 @@ def control(
 ) -> tuple[jax.Array, ControlMemory]:
     """Rotor commands [R] rad/s towards ``setpoint`` and the controller's memory ``dt`` s later.
 
-    Only ``params.control`` is read: the controller does not know the true mass. The commands never disarm a rotor.
+    Only ``params.control`` is read: the controller does not know the true mass. As on a real autopilot, a descent that
+    the ground stops is a landing: the commands are then zero, which disarms the rotors, until a climb is commanded.
     """
     autopilot, body = params.control, state.body
-    acceleration, memory = _acceleration(autopilot, memory, body, setpoint, dt)
+    touching = state.ground_force_n > LANDED_LOAD * GRAVITY_M_S2 * autopilot.mass_kg
+    acceleration, memory = _acceleration(autopilot, memory, body, touching, setpoint, dt)
     pull = acceleration + jnp.array([0.0, 0.0, GRAVITY_M_S2], acceleration.dtype)
     attitude = rotation_matrix(body.quaternion)
     pull_body = to_body(attitude, pull)
@@ -55,7 +73,8 @@ def control(
     w, inertia = body.angular_velocity_rad_s, autopilot.inertia_kg_m2
     torque = inertia * autopilot.rate_gain_1_s * (rate - w) + jnp.cross(w, inertia * w)
     thrust = autopilot.mass_kg * jnp.maximum(pull_body[2], 0.0)
-    return rotor_commands(autopilot, thrust, torque), memory
+    commands = rotor_commands(autopilot, thrust, torque)
+    return jnp.where(is_landed(memory), 0.0, commands), memory
 
 
 def rotor_commands(autopilot: ControlParams, thrust_n: jax.Array, torque_nm: jax.Array) -> jax.Array:
@@ -84,22 +103,42 @@ def rotor_commands(autopilot: ControlParams, thrust_n: jax.Array, torque_nm: jax
 
 
 def _acceleration(
-    autopilot: ControlParams, memory: ControlMemory, body: RigidState, setpoint: Setpoint, dt: float
+    autopilot: ControlParams,
+    memory: ControlMemory,
+    body: RigidState,
+    touching: jax.Array,
+    setpoint: Setpoint,
+    dt: float,
 ) -> tuple[jax.Array, ControlMemory]:
     """Wanted acceleration [3] m/s^2 (world) within the limits; the integral stands still where it would wind up."""
     approach = autopilot.position_gain_1_s * (setpoint.position_m - body.position_m)
     limits = jnp.stack([autopilot.speed_max_m_s, autopilot.climb_rate_max_m_s])
     velocity = _limited(setpoint.velocity_m_s + approach, limits)
     error = velocity - body.velocity_m_s
-    wanted = setpoint.acceleration_m_s2 + autopilot.velocity_gain_1_s * error + memory.integral_m_s2
     reach = autopilot.acceleration_max_m_s2
-    tilt = jnp.minimum(reach, autopilot.tilt_max_tan * jnp.maximum(GRAVITY_M_S2 + wanted[2], LIFT_MIN * GRAVITY_M_S2))
-    floor = (LIFT_MIN - 1.0) * GRAVITY_M_S2
-    given = _limited(wanted, jnp.stack([tilt, reach]))
-    given = given.at[2].set(jnp.maximum(given[2], floor))
+    feedback = setpoint.acceleration_m_s2 + autopilot.velocity_gain_1_s * error
+    wanted = _limited(feedback, jnp.stack([reach, reach])) + memory.integral_m_s2
+    lowest = (LIFT_MIN - 1.0) * GRAVITY_M_S2
+    lift = jnp.maximum(wanted[2], lowest)
+    level = _limited(wanted, jnp.stack([autopilot.tilt_max_tan * (GRAVITY_M_S2 + lift), reach]))
+    given = jnp.stack([level[0], level[1], lift])
     winding = (wanted - given) * error > 0.0  # the limit already cuts in the direction in which it would grow
     integral = memory.integral_m_s2 + jnp.where(winding, 0.0, autopilot.velocity_integral_1_s2 * dt * error)
-    return given, ControlMemory(integral_m_s2=_limited(integral, jnp.stack([reach, reach])))
+    bounds = jnp.stack([autopilot.tilt_max_tan * GRAVITY_M_S2, reach])
+    still = touching & (jnp.sum(body.velocity_m_s * body.velocity_m_s) < LANDED_SPEED_M_S**2)
+    return given, ControlMemory(
+        integral_m_s2=_limited(integral, bounds), stuck_s=_stuck(memory.stuck_s, velocity[2], still, dt)
+    )
+
+
+def _stuck(stuck_s: jax.Array, climb_m_s: jax.Array, still: jax.Array, dt: float) -> jax.Array:
+    """Time [] s for which the vehicle has stood ``still`` on the ground although ``climb_m_s`` [] commands a descent.
+
+    It starts again when the vehicle moves, unless it has landed already; a commanded climb clears it.
+    """
+    longer = jnp.where((climb_m_s < -LANDED_DESCENT_M_S) & still, stuck_s + dt, 0.0)
+    kept = jnp.where(stuck_s >= LANDED_AFTER_S, stuck_s, longer)
+    return jnp.where(climb_m_s > LANDED_DESCENT_M_S, 0.0, kept)
 
 
 def _limited(v: jax.Array, limits: jax.Array) -> jax.Array:
@@ -116,9 +155,7 @@ def _body_rate(autopilot: ControlParams, attitude: jax.Array, pull_body: jax.Arr
     reach = autopilot.attitude_gain_1_s * jax.lax.rsqrt(jnp.maximum(0.5 * (1.0 + direction[2]), 1e-4))
     forward_x, forward_y = attitude[0, 0], attitude[1, 0]
     cosine, sine = jnp.cos(yaw_rad), jnp.sin(yaw_rad)
-    heading_error = jnp.arctan2(
-        forward_x * sine - forward_y * cosine, forward_x * cosine + forward_y * sine + 1e-9
-    )
+    heading_error = jnp.arctan2(forward_x * sine - forward_y * cosine, forward_x * cosine + forward_y * sine + 1e-9)
     turn = jnp.clip(autopilot.yaw_gain_1_s * heading_error, -autopilot.yaw_rate_max_rad_s, autopilot.yaw_rate_max_rad_s)
     about_vertical = turn * attitude[2]  # the world's vertical in the body frame
     return jnp.stack(

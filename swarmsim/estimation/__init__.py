@@ -1,7 +1,7 @@
 """From measurements to knowledge: radiation map, hotspots, source localisation.
 
-Everything here is a pure function of one mission with fixed sizes (masks instead of dynamic shapes), to be jitted and vmapped by
-the missions layer.
+Everything here is a pure function of one mission with fixed sizes (masks instead of dynamic shapes), to be jitted and
+vmapped by the missions layer.
 """
 
 from swarmsim.estimation.hotspots import Hotspots, extract_hotspots, initial_points

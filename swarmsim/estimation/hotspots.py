@@ -21,9 +21,10 @@ class Hotspots:
 def extract_hotspots(params: MappingParams, radiation_map: RadiationMap) -> Hotspots:
     """The cells that are the most significant of their neighbourhood and above ``params.significance_sigma``.
 
-    The neighbourhood is a square that reaches one hotspot separation to each side, so two hotspots are further apart than
-    that, and the flank of a strong one is none itself. Significances are standard normal under bare background, so the
-    chance of any false hotspot is at most (cells) x Q(sigma) by the union bound: 1.1e-3 for 4000 cells at 5 sigma.
+    The neighbourhood is a square that reaches one hotspot separation to each side, so two hotspots are further apart
+    than that, and the flank of a strong one is none itself. Significances are standard normal under bare background,
+    so the chance of any false hotspot is at most (cells) x Q(sigma) by the union bound: 1.1e-3 for 4000 cells at 5
+    sigma.
     """
     significance = radiation_map.significance
     ny, nx = significance.shape

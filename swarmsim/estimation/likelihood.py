@@ -1,8 +1,8 @@
 """Likelihood of detector counts for one point source: forward model, score and Fisher information.
 
-The parameters are theta = (x, y, height above the ground, log activity in Bq, log background scale). Counts are Poisson with mean
-exposure * observed_rate(activity * r + extra + (scale - 1) * background), r being the detector's net rate per becquerel through the
-known site; the background scale multiplies every detector's nominal background.
+The parameters are theta = (x, y, height above the ground, log activity in Bq, log background scale). Counts are
+Poisson with mean exposure * observed_rate(activity * r + extra + (scale - 1) * background), r being the detector's
+net rate per becquerel through the known site; the background scale multiplies every detector's nominal background.
 """
 
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.measurements import Measurements
+from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.pytree import pytree
 from swarmsim.radiation import Detector, Source, net_rate, observed_rate
 from swarmsim.site import Site, path_lengths, sample, sample_with_gradient
@@ -22,7 +22,7 @@ BLOCK = 128  # windows evaluated together: their rays through all boxes stay in 
 
 
 @pytree
-class Problem:
+class FitProblem:
     """Everything a likelihood is conditioned on."""
 
     site: Site
@@ -82,10 +82,10 @@ def _of_detector(values: list[Any], which: jax.Array) -> jax.Array:
 
 
 def poisson_log_likelihood(counts: jax.Array, mean: jax.Array, valid: jax.Array) -> jax.Array:
-    """Log likelihood [] of Poisson counts [n], relative to the saturated model (mean = counts): half the negative deviance.
+    """Log likelihood [] of Poisson counts [n], relative to the saturated model: half the negative deviance.
 
-    Each term k log(mean/k) - (mean - k) is of the order of one, where k log(mean) - mean is hundreds: summed over 1000 windows in
-    float32 the latter would lose the tenths that decide between positions.
+    Each term k log(mean/k) - (mean - k) is of the order of one, where k log(mean) - mean is hundreds: summed over
+    1000 windows in float32 the latter would lose the tenths that decide between positions.
     """
     mean = jnp.maximum(mean, MEAN_FLOOR)
     safe = jnp.where(counts > 0.0, counts, 1.0)
@@ -94,17 +94,18 @@ def poisson_log_likelihood(counts: jax.Array, mean: jax.Array, valid: jax.Array)
     return jnp.sum(jnp.where(valid, jnp.where(counts > 0.0, seen, -mean), 0.0))
 
 
-def expected_counts(problem: Problem, net_cps: jax.Array, log_scale: jax.Array) -> jax.Array:
+def expected_counts(problem: FitProblem, net_cps: jax.Array, log_scale: jax.Array) -> jax.Array:
     """Mean counts [n] for net rates [n] of the source sought; the known extra rate is added."""
     m = problem.measurements
     return m.exposure_s * observed_rates(problem.detectors, m, net_cps + problem.extra_cps, jnp.exp(log_scale))
 
 
-def evaluate(problem: Problem, theta: jax.Array) -> Evaluation:
+def evaluate(problem: FitProblem, theta: jax.Array) -> Evaluation:
     """Likelihood, score and Fisher information at ``theta`` [5], with the exact path lengths at every place asked for.
 
-    Derivatives along the position are central differences over ±5 cm: a path through boxes is continuous but has kinks at their
-    edges, where a one-sided derivative would misjudge the information; everything else is differentiated exactly.
+    Derivatives along the position are central differences over ±5 cm: a path through boxes is continuous but has
+    kinks at their edges, where a one-sided derivative would misjudge the information; everything else is
+    differentiated exactly.
     """
     m = problem.measurements
     steps = STEP_M * jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3), -jnp.eye(3)])
@@ -147,7 +148,7 @@ def fisher_information(
     background_scale: jax.Array | float = 1.0,
     extra_rate_cps: jax.Array | float = 0.0,
 ) -> jax.Array:
-    """Fisher information [5, 5] that samples at given places and exposures hold about a source; their counts do not matter.
+    """Fisher information [5, 5] that samples hold about a source; only where and how long they were taken matters.
 
     Args:
         site: the known site.
@@ -160,17 +161,16 @@ def fisher_information(
         extra_rate_cps: [] or [n] net rate of other sources.
 
     Returns:
-        Information about (x m, y m, height above ground m, log activity, log background scale), without any prior. Its inverse is
-        the Cramér–Rao bound: see `cramer_rao_covariance`.
+        Information about (x m, y m, height above ground m, log activity, log background scale), without any prior.
+        Its inverse is the Cramér–Rao bound: see `cramer_rao_covariance`.
     """
     height = position_m[2] - sample(site.terrain_m, site, position_m[:2])
-    theta = jnp.stack(
-        [position_m[0], position_m[1], height, jnp.log(activity_bq), jnp.log(jnp.asarray(background_scale, jnp.float32))]
-    )
-    problem = Problem(
+    scale = jnp.asarray(background_scale, jnp.float32)
+    theta = jnp.stack([position_m[0], position_m[1], height, jnp.log(activity_bq), jnp.log(scale)])
+    problem = FitProblem(
         site=site,
         detectors=detectors,
-        measurements=measurements,
+        measurements=cleared(measurements),
         nuclide=nuclide,
         extra_cps=jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), measurements.counts.shape),
         height_m=height,

@@ -2,13 +2,13 @@
 
 Two stages, because rays through walls and terrain cost a hundred times what the rest of the likelihood does:
 
-1. Adam (optax) with a cosine-decayed step from several starts. The exact net rates r0 are computed at the start of each of
-   `SEGMENTS` segments; within one, r = r0 d0² / d² with d the distance to the crystal, the only part that changes quickly. What is
-   held (attenuation, build-up, direction) changes r by a few per cent over the few metres of a segment, and is exact again at
-   the next.
-2. From the best end point, by exact likelihood: damped Fisher scoring (Levenberg–Marquardt on the Poisson likelihood, Osborne
-   1992) in which every evaluation uses exact path lengths. It removes what the first stage left, and its fixed point is that of the
-   exact likelihood.
+1. Adam (optax) with a cosine-decayed step from several starts. The exact net rates r0 are computed at the start of
+   each of `SEGMENTS` segments; within one, r = r0 d0² / d² with d the distance to the crystal, the only part that
+   changes quickly. What is held (attenuation, build-up, direction) changes r by a few per cent over the few metres of
+   a segment, and is exact again at the next.
+2. From the best end point, by exact likelihood: damped Fisher scoring (Levenberg–Marquardt on the Poisson likelihood,
+   Osborne 1992) in which every evaluation uses exact path lengths. It removes what the first stage left, and its
+   fixed point is that of the exact likelihood.
 """
 
 import jax
@@ -19,7 +19,7 @@ from swarmsim.config.mission import Localisation
 from swarmsim.estimation.likelihood import (
     FIXED_STD_M,
     Evaluation,
-    Problem,
+    FitProblem,
     evaluate,
     expected_counts,
     height_precision,
@@ -30,7 +30,7 @@ from swarmsim.estimation.likelihood import (
     position_of,
     scaled_inverse,
 )
-from swarmsim.estimation.measurements import Measurements
+from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector
 from swarmsim.site import Site, sample_with_gradient
@@ -41,7 +41,7 @@ LOG_ACTIVITY = (0.0, 34.5)  # 1 Bq to 1e15 Bq
 LOG_SCALE = (-4.6, 4.6)  # 1 % to 100 times the nominal background
 LOG_STEP = 1.0  # longest Fisher step of a logarithm
 POSITION_STEP_M = 10.0  # longest Fisher step of a coordinate
-DECREMENT = 0.01  # squared length, in standard deviations, of a Fisher step that counts as converged
+SETTLED_NATS = 0.02  # gain of the last Fisher steps below which the fit has converged: 0.2 standard deviations
 HEIGHT_REACH = 4.0  # the height is sought within this many of its standard deviations
 # Adam moves every coordinate by about its rate per iteration: logarithms by these per metre of learning rate.
 LOG_RATES = (0.3, 0.1)
@@ -70,7 +70,7 @@ class SourceFit:
     log_likelihood: jax.Array  # [] nats, relative to the saturated model
     log_likelihood_background_only: jax.Array  # [] the same without a source, background scale fitted
     detection: jax.Array  # [] twice their difference: generalised likelihood ratio, see `detected`
-    converged: jax.Array  # [] bool: the next step would be below a tenth of the standard deviation, and the place is in the site
+    converged: jax.Array  # [] bool: the last steps gained nothing, and the place is within the site
 
 
 def localisation_params(spec: Localisation) -> LocalisationParams:
@@ -101,67 +101,57 @@ def localise(
         measurements: windows, about a second each.
         initial_xy: [S, 2] starting points, m, world ENU (`initial_points`).
         nuclide: [] int32 index in the library's order.
-        params: settings.
-        extra_rate_cps: [] or [n] net rate of sources already known, to find several one after the other (`net_rates`).
+        params: settings. extra_rate_cps: [] or [n] net rate of sources already known, to find several one after the
+        other (`net_rates`).
 
     Returns:
         The fit. It always exists: ask `detected` whether there is a source at all.
     """
-    extra = jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), measurements.counts.shape)
-    problem = Problem(
+    m = cleared(measurements)
+    extra = jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), m.counts.shape)
+    problem = FitProblem(
         site=site,
         detectors=detectors,
-        measurements=_cleared(measurements),
+        measurements=m,
         nuclide=nuclide,
-        extra_cps=jnp.where(measurements.valid, extra, 0.0),
+        extra_cps=jnp.where(m.valid, extra, 0.0),
         height_m=params.presumed_height_m,
         height_std_m=params.height_std_m,
     )
     bounds = _bounds(problem)
     log_scale, background_only = _background_only(problem)
     candidates = _search(problem, bounds, initial_xy, log_scale, params)
-    theta, found = _polish(problem, bounds, _best(problem, candidates), params.fisher_steps)
-    return _report(problem, bounds, theta, found, background_only)
+    theta, found, settled = _polish(problem, bounds, _best(problem, candidates), params.fisher_steps)
+    return _report(problem, bounds, theta, found, settled, background_only)
 
 
 def detected(fit: SourceFit, significance_sigma: jax.Array | float) -> jax.Array:
     """Whether there is a source: the likelihood ratio exceeds ``significance_sigma`` squared.
 
-    At one given place twice the log likelihood ratio of an activity >= 0 is, without a source, half a chi-square of one degree of
-    freedom (Chernoff 1954), so its root exceeds s with chance Q(s); the search over places multiplies this by about the number of
-    detector footprints in the site (some tens), which 5 sigma (Q = 2.9e-7) leaves far below one per cent.
+    At one given place twice the log likelihood ratio of an activity >= 0 is, without a source, half a chi-square of
+    one degree of freedom (Chernoff 1954), so its root exceeds s with chance Q(s); the search over places multiplies
+    this by about the number of detector footprints in the site (some tens), which 5 sigma (Q = 2.9e-7) leaves far
+    below one per cent.
     """
     return fit.detection > jnp.square(significance_sigma)
 
 
-def _cleared(m: Measurements) -> Measurements:
-    """Padding rows made harmless: no counts, no exposure, one metre above the first row's place."""
-    v = m.valid
-    return Measurements(
-        time_s=jnp.where(v, m.time_s, 0.0),
-        position_m=jnp.where(v[:, None], m.position_m, jnp.array([0.0, 0.0, 1e4])),
-        axis=jnp.where(v[:, None], m.axis, jnp.array([0.0, 0.0, 1.0])),
-        counts=jnp.where(v, m.counts, 0).astype(jnp.float32),
-        exposure_s=jnp.where(v, m.exposure_s, 0.0),
-        valid=v,
-        detector=jnp.where(v, m.detector, 0),
-    )
-
-
-def _bounds(problem: Problem) -> tuple[jax.Array, jax.Array]:
+def _bounds(problem: FitProblem) -> tuple[jax.Array, jax.Array]:
     """Lower and upper bounds [5] of theta."""
     site = problem.site
     ny, nx = site.terrain_m.shape
     extent = site.cell_m * jnp.array([nx - 1, ny - 1], jnp.float32)
     reach = HEIGHT_REACH * jnp.maximum(problem.height_std_m, FIXED_STD_M)
-    low = jnp.concatenate([site.origin_m, jnp.stack([problem.height_m - reach]), jnp.array([LOG_ACTIVITY[0], LOG_SCALE[0]])])
-    high = jnp.concatenate(
-        [site.origin_m + extent, jnp.stack([problem.height_m + reach]), jnp.array([LOG_ACTIVITY[1], LOG_SCALE[1]])]
+
+    def limits(corner: jax.Array, height: jax.Array, end: int) -> jax.Array:
+        return jnp.concatenate([corner, height[None], jnp.array([LOG_ACTIVITY[end], LOG_SCALE[end]])])
+
+    return limits(site.origin_m, problem.height_m - reach, 0), limits(
+        site.origin_m + extent, problem.height_m + reach, 1
     )
-    return low, high
 
 
-def _background_only(problem: Problem) -> tuple[jax.Array, jax.Array]:
+def _background_only(problem: FitProblem) -> tuple[jax.Array, jax.Array]:
     """Best log background scale [] without a source, and its log likelihood []."""
     m = problem.measurements
     none = jnp.zeros_like(m.counts)
@@ -177,7 +167,7 @@ def _background_only(problem: Problem) -> tuple[jax.Array, jax.Array]:
     return log_scale, poisson_log_likelihood(m.counts, expected_counts(problem, none, log_scale), m.valid)
 
 
-def _profile(problem: Problem, rates: jax.Array, log_scale: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _profile(problem: FitProblem, rates: jax.Array, log_scale: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Best log activity and log scale [] at a held position with net rates ``rates`` [n] per becquerel."""
     m = problem.measurements
     # Start where the source gives as much as the background to the windows that see it best.
@@ -192,17 +182,14 @@ def _profile(problem: Problem, rates: jax.Array, log_scale: jax.Array) -> tuple[
         j = jnp.where(m.valid, jnp.stack([jacobian, by_scale]), 0.0)
         f = (j / mean) @ j.T
         delta = scaled_inverse(f) @ (j @ ((m.counts - mean) / mean))
-        return v + jnp.clip(delta, -LOG_STEP, LOG_STEP)
+        return jnp.clip(v + jnp.clip(delta, -LOG_STEP, LOG_STEP), *jnp.array([LOG_ACTIVITY, LOG_SCALE]).T)
 
-    low, high = (jnp.array([LOG_ACTIVITY[i], LOG_SCALE[i]]) for i in (0, 1))
-    v = jax.lax.fori_loop(
-        0, PROFILE_STEPS, lambda i, v: jnp.clip(step(i, v), low, high), jnp.stack([jnp.clip(start, *LOG_ACTIVITY), log_scale])
-    )
+    v = jax.lax.fori_loop(0, PROFILE_STEPS, step, jnp.stack([jnp.clip(start, *LOG_ACTIVITY), log_scale]))
     return v[0], v[1]
 
 
 def _search(
-    problem: Problem,
+    problem: FitProblem,
     bounds: tuple[jax.Array, jax.Array],
     initial_xy: jax.Array,
     log_scale: jax.Array,
@@ -222,13 +209,15 @@ def _search(
     columns = (initial_xy[:, 0], initial_xy[:, 1], zero + problem.height_m, zero, zero + log_scale)
     theta = jnp.clip(jnp.stack(columns, axis=-1), low, high)
     logs = jax.vmap(lambda r: _profile(problem, r, log_scale))(exact(theta))
-    theta = theta.at[:, 3:].set(logs)
+    theta = theta.at[:, 3:].set(jnp.stack(logs, axis=-1))
     gradient = jax.vmap(jax.grad(_held_loss), (0, 0, 0, None))
 
-    def segment(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple[jax.Array, optax.OptState], None]:
+    Carry = tuple[jax.Array, optax.OptState]
+
+    def segment(carry: Carry, _: None) -> tuple[Carry, None]:
         anchor, rates = carry[0], exact(carry[0])
 
-        def iteration(carry: tuple[jax.Array, optax.OptState], _: None) -> tuple[tuple[jax.Array, optax.OptState], None]:
+        def iteration(carry: Carry, _: None) -> tuple[Carry, None]:
             theta, memory = carry
             update, memory = optimiser.update(gradient(theta, anchor, rates, problem), memory)
             return (jnp.clip(theta + rate * update, low, high), memory), None
@@ -238,41 +227,47 @@ def _search(
     return jax.lax.scan(segment, (theta, optimiser.init(theta)), None, length=SEGMENTS)[0][0]
 
 
-def _exact_rates(problem: Problem, theta: jax.Array) -> jax.Array:
+def _exact_rates(problem: FitProblem, theta: jax.Array) -> jax.Array:
     """Net rate [n] per becquerel at ``theta``."""
     place = position_of(problem.site, theta)
     return net_rates(problem.site, problem.detectors, problem.measurements, place, problem.nuclide)
 
 
-def _held_loss(theta: jax.Array, anchor: jax.Array, rates: jax.Array, problem: Problem) -> jax.Array:
+def _held_loss(theta: jax.Array, anchor: jax.Array, rates: jax.Array, problem: FitProblem) -> jax.Array:
     """Negative log posterior [] with the net rates [n] at ``anchor`` [5] moved by the inverse square law alone."""
     ground, slope = sample_with_gradient(problem.site.terrain_m, problem.site, anchor[:2])
     start = jnp.append(anchor[:2], ground + anchor[2])
     place = jnp.append(theta[:2], ground + slope @ (theta[:2] - anchor[:2]) + theta[2])
     crystal = problem.measurements.position_m
-    held = rates * jnp.sum((crystal - start) ** 2, axis=-1) / jnp.maximum(jnp.sum((crystal - place) ** 2, axis=-1), 1e-4)
+    then, now = (jnp.sum((crystal - p) ** 2, axis=-1) for p in (start, place))
+    held = rates * then / jnp.maximum(now, 1e-4)
     return -_log_posterior(problem, theta, jnp.exp(theta[3]) * held)
 
 
-def _log_posterior(problem: Problem, theta: jax.Array, net_cps: jax.Array) -> jax.Array:
+def _log_posterior(problem: FitProblem, theta: jax.Array, net_cps: jax.Array) -> jax.Array:
     m = problem.measurements
     prior = 0.5 * height_precision(problem.height_std_m) * (theta[2] - problem.height_m) ** 2
     return poisson_log_likelihood(m.counts, expected_counts(problem, net_cps, theta[4]), m.valid) - prior
 
 
-def _best(problem: Problem, candidates: jax.Array) -> jax.Array:
+def _best(problem: FitProblem, candidates: jax.Array) -> jax.Array:
     """The candidate [5] of largest exact posterior among [S, 5]."""
     posterior = jax.lax.map(lambda t: _log_posterior(problem, t, jnp.exp(t[3]) * _exact_rates(problem, t)), candidates)
     return candidates[jnp.argmax(jnp.where(jnp.isnan(posterior), -jnp.inf, posterior))]
 
 
 def _polish(
-    problem: Problem, bounds: tuple[jax.Array, jax.Array], theta: jax.Array, steps: int
-) -> tuple[jax.Array, Evaluation]:
-    """Second stage: damped Fisher scoring from ``theta`` [5]; returns the end point and the likelihood there."""
-    reach = jnp.array([POSITION_STEP_M, POSITION_STEP_M, POSITION_STEP_M, LOG_STEP, LOG_STEP])
+    problem: FitProblem, bounds: tuple[jax.Array, jax.Array], theta: jax.Array, steps: int
+) -> tuple[jax.Array, Evaluation, jax.Array]:
+    """Second stage: damped Fisher scoring from ``theta`` [5]; the end point, the likelihood there, whether it settled.
 
-    def step(_: int, carry: tuple[jax.Array, Evaluation, jax.Array]) -> tuple[jax.Array, Evaluation, jax.Array]:
+    Settled means that the last steps gained nothing, not that the score is zero: at the edge of a wall's shadow the
+    best place is a kink of the likelihood.
+    """
+    reach = jnp.array([POSITION_STEP_M, POSITION_STEP_M, POSITION_STEP_M, LOG_STEP, LOG_STEP])
+    Carry = tuple[jax.Array, Evaluation, jax.Array]
+
+    def step(carry: Carry, _: None) -> tuple[Carry, jax.Array]:
         theta, here, damping = carry
         damped = here.information + damping * jnp.diag(jnp.diagonal(here.information))
         move = scaled_inverse(damped) @ here.score
@@ -281,26 +276,26 @@ def _polish(
         there = evaluate(problem, trial)
         better = there.log_posterior >= here.log_posterior
         chosen = jax.tree.map(lambda a, b: jnp.where(better, a, b), (trial, there), (theta, here))
-        return (*chosen, jnp.clip(damping * jnp.where(better, 0.1, 10.0), 1e-6, 1e4))
+        return (*chosen, jnp.clip(damping * jnp.where(better, 0.1, 10.0), 1e-6, 1e4)), here.log_posterior
 
     start = (theta, evaluate(problem, theta), jnp.asarray(1e-3))
-    theta, here, _ = jax.lax.fori_loop(0, steps, step, start)
-    return theta, here
+    (theta, here, _), before = jax.lax.scan(step, start, None, length=steps)
+    return theta, here, here.log_posterior - before[-max(1, steps // 3)] < SETTLED_NATS
 
 
 def _report(
-    problem: Problem,
+    problem: FitProblem,
     bounds: tuple[jax.Array, jax.Array],
     theta: jax.Array,
     here: Evaluation,
-    background_only: tuple[jax.Array, jax.Array],
+    settled: jax.Array,
+    background_only: jax.Array,
 ) -> SourceFit:
     """The fit at the end point ``theta`` [5]."""
     low, high = bounds
     # Where the data say nothing, a coordinate is known to the range it was sought in: uniform, variance range² / 12.
     information = here.information + jnp.diag(12.0 / jnp.square(high - low))
     covariance = scaled_inverse(information)
-    decrement = here.score @ covariance @ here.score
     inside = jnp.all((theta[:2] > low[:2]) & (theta[:2] < high[:2]))
     activity = jnp.exp(theta[3])
     return SourceFit(
@@ -310,7 +305,7 @@ def _report(
         covariance_m2=position_covariance(problem.site, theta, covariance),
         activity_std_bq=activity * jnp.sqrt(covariance[3, 3]),
         log_likelihood=here.log_likelihood,
-        log_likelihood_background_only=background_only[1],
-        detection=jnp.maximum(2.0 * (here.log_likelihood - background_only[1]), 0.0),
-        converged=(decrement < DECREMENT) & inside,
+        log_likelihood_background_only=background_only,
+        detection=jnp.maximum(2.0 * (here.log_likelihood - background_only), 0.0),
+        converged=settled & inside,
     )

@@ -22,11 +22,12 @@ class Measurements:
 def aggregate(measurements: Measurements, per_window: int) -> Measurements:
     """Sum every ``per_window`` consecutive measurements to one window.
 
-    Counts and exposures add up (a sum of Poisson variables is Poisson); the position is the exposure-weighted mean, the axis the
-    exposure-weighted mean made a unit vector again, the time that of the last valid sample, the detector that of the first. The rate
-    at the mean position differs from the mean rate by about (v T)² / 24 times the rate's curvature: 0.3 % for a window of 2.5 m seen
-    from 20 m. Samples must be ordered so that a window holds one vehicle (and one detector) only: aggregate each vehicle's own
-    samples (vmap over vehicles), then `concatenate`. A remainder shorter than a window makes a last, shorter window.
+    Counts and exposures add up (a sum of Poisson variables is Poisson); the position is the exposure-weighted mean,
+    the axis the exposure-weighted mean made a unit vector again, the time that of the last valid sample, the detector
+    that of the first. The rate at the mean position differs from the mean rate by about (v T)² / 24 times the rate's
+    curvature: 0.3 % for a window of 2.5 m seen from 20 m. Samples must be ordered so that a window holds one vehicle
+    (and one detector) only: aggregate each vehicle's own samples (vmap over vehicles), then `concatenate`. A
+    remainder shorter than a window makes a last, shorter window.
 
     Args:
         measurements: n samples.
@@ -68,7 +69,7 @@ def aggregate(measurements: Measurements, per_window: int) -> Measurements:
 
 
 def concatenate(*parts: Measurements) -> Measurements:
-    """Measurements of several vehicles or phases after one another; leading axes (vehicle, sample) are flattened first."""
+    """Measurements of several vehicles or phases after one another; leading axes (vehicle, sample) are flattened."""
 
     def flat(x: jax.Array, trailing: int) -> jax.Array:
         return x.reshape(-1, *x.shape[x.ndim - trailing :]) if trailing else x.reshape(-1)
@@ -79,3 +80,19 @@ def concatenate(*parts: Measurements) -> Measurements:
     vectors = ("position_m", "axis")
     names = Measurements.__dataclass_fields__  # type: ignore[attr-defined]
     return Measurements(**{f: join(*(getattr(p, f) for p in parts), trailing=int(f in vectors)) for f in names})
+
+
+def cleared(m: Measurements) -> Measurements:
+    """The same with harmless contents in rows that are not valid, or have no exposure or a non-finite value."""
+    finite = jnp.isfinite(m.counts) & jnp.isfinite(m.exposure_s)
+    finite &= jnp.all(jnp.isfinite(m.position_m) & jnp.isfinite(m.axis), axis=-1)
+    valid = m.valid & finite & (m.exposure_s > 0.0)
+    return Measurements(
+        time_s=jnp.where(valid, m.time_s, 0.0),
+        position_m=jnp.where(valid[:, None], m.position_m, jnp.array([0.0, 0.0, 1e4])),
+        axis=jnp.where(valid[:, None], m.axis, jnp.array([0.0, 0.0, 1.0])),
+        counts=jnp.where(valid, m.counts, 0).astype(jnp.float32),
+        exposure_s=jnp.where(valid, m.exposure_s, 0.0),
+        valid=valid,
+        detector=jnp.where(valid, m.detector, 0),
+    )

@@ -1,11 +1,12 @@
 """Counts interpolated to a map of the rate with its uncertainty: a Gaussian process of low rank.
 
-The rate over the area is a constant background plus a Gaussian process with the separable Matérn 5/2 kernel
-k(dx) k(dy), k(d) = (1 + a + a²/3) exp(-a), a = sqrt(5) |d| / length scale (Rasmussen & Williams 2006, eq. 4.17). A separable
-kernel has a Karhunen–Loève expansion that is a product of two expansions in one dimension, so the best basis of a given size costs
-two small eigenproblems on the host. What the truncated basis misses is added to the noise of samples and to the variance of cells as
-an independent remainder, the "fully independent training conditional" (Snelson & Ghahramani 2006; Quiñonero-Candela & Rasmussen
-2005, section 6), so the posterior stays that of a proper Gaussian process.
+The rate over the area is a constant background plus a Gaussian process with the separable Matérn 5/2 kernel k(dx)
+k(dy), k(d) = (1 + a + a²/3) exp(-a), a = sqrt(5) |d| / length scale (Rasmussen & Williams 2006, eq. 4.17). A
+separable kernel has a Karhunen–Loève expansion that is a product of two expansions in one dimension, so the best
+basis of a given size costs two small eigenproblems on the host. What the truncated basis misses is added to the noise
+of samples and to the variance of cells as an independent remainder, the "fully independent training conditional"
+(Snelson & Ghahramani 2006; Quiñonero-Candela & Rasmussen 2005, section 6), so the posterior stays that of a proper
+Gaussian process.
 """
 
 import jax
@@ -15,12 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.mission import Mapping
-from swarmsim.estimation.measurements import Measurements
+from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.pytree import pytree, static
 
 Floats = NDArray[np.floating]
+Basis = tuple[Floats, Floats, Floats]  # support [g], projection [g, p], values at the cells [nc, p]
 
-VARIANCE_KEPT = 0.97  # of the prior's variance in the basis, mean over the map
+VARIANCE_KEPT = 0.95  # of the prior's variance in the basis, mean over the map
 RANK_MAX = 1024  # a larger basis would take seconds and hundreds of megabytes
 CELLS_MAX = 250_000
 CHUNK = 128  # samples taken into the normal equations at a time: bounds the memory of large batches
@@ -76,31 +78,35 @@ def mapping_params(spec: Mapping, area_m: ArrayLike, variance_kept: float = VARI
     shape = np.maximum(np.ceil(extent / spec.cell_m - 1e-6).astype(int), 1)
     if shape.prod() > CELLS_MAX:
         raise InputError.of(
-            f"mapping.cell_m of {spec.cell_m:g} m makes a map of {shape[0]} x {shape[1]} cells over an area of {extent[0]:.0f} x "
-            f"{extent[1]:.0f} m; at most {CELLS_MAX} cells are possible: give a larger cell_m or a smaller area"
+            f"mapping.cell_m of {spec.cell_m:g} m makes a map of {shape[0]} x {shape[1]} cells over an area of "
+            f"{extent[0]:.0f} x {extent[1]:.0f} m; at most {CELLS_MAX} cells are possible: give a larger cell_m or a smaller area"
         )
     origin = low + 0.5 * (extent - (shape - 1) * spec.cell_m)
     cells = [origin[i] + spec.cell_m * np.arange(shape[i]) for i in range(2)]
     bases = [_basis(c, spec.length_scale_m) for c in cells]
     pairs = _pairs(bases, variance_kept, spec.length_scale_m)
     (support_x, project_x, columns), (support_y, project_y, rows) = (
-        (support, project[:, pair], values[:, pair]) for (support, project, values), pair in zip(bases, pairs, strict=True)
+        (support, project[:, pair], values[:, pair])
+        for (support, project, values), pair in zip(bases, pairs, strict=True)
     )
-    f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     return MappingParams(
-        origin_m=f32(origin),
-        cell_m=f32(spec.cell_m),
-        length_scale_m=f32(spec.length_scale_m),
-        support_x_m=f32(support_x),
-        support_y_m=f32(support_y),
-        project_x=f32(project_x),
-        project_y=f32(project_y),
-        columns=f32(columns),
-        rows=f32(rows),
-        significance_sigma=f32(spec.significance_sigma),
+        origin_m=_float32(origin),
+        cell_m=_float32(spec.cell_m),
+        length_scale_m=_float32(spec.length_scale_m),
+        support_x_m=_float32(support_x),
+        support_y_m=_float32(support_y),
+        project_x=_float32(project_x),
+        project_y=_float32(project_y),
+        columns=_float32(columns),
+        rows=_float32(rows),
+        significance_sigma=_float32(spec.significance_sigma),
         hotspots_max=spec.hotspots_max,
         separation_cells=max(1, int(np.ceil(spec.hotspot_separation_m / spec.cell_m))),
     )
+
+
+def _float32(x: ArrayLike) -> jax.Array:
+    return jnp.asarray(x, jnp.float32)
 
 
 def _matern_host(distance: Floats, length_scale: float) -> Floats:
@@ -108,7 +114,7 @@ def _matern_host(distance: Floats, length_scale: float) -> Floats:
     return (1.0 + a + a * a / 3.0) * np.exp(-a)
 
 
-def _basis(cells: Floats, length_scale: float) -> tuple[Floats, Floats, Floats]:
+def _basis(cells: Floats, length_scale: float) -> Basis:
     """Support [g], projection [g, p] and values at the cells [nc, p] of the 1-D expansion, largest eigenvalue first."""
     margin = 0.5 * length_scale
     count = max(int(np.ceil((cells[-1] - cells[0] + 2 * margin) / (0.4 * length_scale))), 2) + 1
@@ -119,16 +125,16 @@ def _basis(cells: Floats, length_scale: float) -> tuple[Floats, Floats, Floats]:
     return support, project, _matern_host(cells[:, None] - support, length_scale) @ project
 
 
-def _pairs(bases: list[tuple[Floats, Floats, Floats]], variance_kept: float, length_scale: float) -> tuple[NDArray, NDArray]:
-    """Which products of x and y functions to keep: those of most variance on the map, until ``variance_kept`` is reached."""
+def _pairs(bases: list[Basis], variance_kept: float, length_scale: float) -> tuple[NDArray, NDArray]:
+    """Which products of x and y functions to keep: those of most variance, until ``variance_kept`` is reached."""
     x, y = (np.mean(values**2, axis=0) for _, _, values in bases)
     variance = np.outer(x, y).ravel()
     order = np.argsort(-variance, kind="stable")
     rank = int(np.searchsorted(np.cumsum(variance[order]), variance_kept)) + 1
     if rank > RANK_MAX:
         raise InputError.of(
-            f"mapping.length_scale_m of {length_scale:g} m is too short for the size of the survey area (it needs {rank} basis "
-            f"functions, at most {RANK_MAX} are possible): give a longer length_scale_m or a smaller area"
+            f"mapping.length_scale_m of {length_scale:g} m is too short for the size of the survey area (it needs {rank} "
+            f"basis functions, at most {RANK_MAX} are possible): give a longer length_scale_m or a smaller area"
         )
     i, j = np.unravel_index(order[:rank], (x.size, y.size))
     return i, j
@@ -137,12 +143,14 @@ def _pairs(bases: list[tuple[Floats, Floats, Floats]], variance_kept: float, len
 def interpolate(params: MappingParams, measurements: Measurements) -> RadiationMap:
     """Map of the count rate from counts at known places (one detector type, one height above ground).
 
-    The background level is the median of a kernel-smoothed rate over the windows; the noise of a window is the Poisson variance at
-    its smoothed (not its own) count, as weights from own counts would favour low draws; the prior's variance is the mean square of
-    the smoothed excess (empirical Bayes). All are finite for any input; without a valid sample the map is 0 ± 1 and insignificant.
+    The background level is the median of a kernel-smoothed rate over the windows; the noise of a window is the
+    Poisson variance at its smoothed (not its own) count, as weights from own counts would favour low draws; the
+    prior's variance is the mean square of the smoothed excess (empirical Bayes). All are finite for any input;
+    without a valid sample the map is 0 ± 1 and insignificant.
     """
-    rate, noise, background, variance = _levels(params, measurements)
-    mean, var, gain, noise_var = posterior(params, measurements, rate, noise, background, variance)
+    m = cleared(measurements)
+    rate, noise, background, variance = _levels(params, m)
+    mean, var, gain, noise_var = posterior(params, m, rate, noise, background, variance)
     return RadiationMap(
         mean_cps=mean,
         std_cps=jnp.sqrt(jnp.maximum(var, 0.0)),
@@ -160,7 +168,7 @@ def _kernels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Arr
 
 def _levels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Rate [n], its noise variance [n], background level [] and prior variance [] from kernel-smoothed counts."""
-    counts, exposure = (jnp.where(m.valid, v, 0.0) for v in (m.counts, m.exposure_s))
+    counts, exposure = m.counts, m.exposure_s
     kx, ky = _kernels(params, m)
 
     def smooth(v: jax.Array) -> jax.Array:
@@ -168,7 +176,7 @@ def _levels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Arra
 
     smoothed = smooth(counts) / jnp.maximum(smooth(exposure), 1e-9)
     live = jnp.where(m.valid, m.exposure_s, 1.0)
-    # A window expected to hold less than one count is given the variance of one: its rate is not known better than that.
+    # A window expected to hold less than one count is given the variance of one: its rate is known no better.
     noise = jnp.maximum(smoothed * live, 1.0) / (live * live)
     number = jnp.sum(m.valid)
     ordered = jnp.sort(jnp.where(m.valid, smoothed, jnp.inf))
@@ -183,7 +191,12 @@ def _levels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Arra
 
 
 def posterior(
-    params: MappingParams, m: Measurements, rate: jax.Array, noise: jax.Array, background: jax.Array, variance: jax.Array
+    params: MappingParams,
+    m: Measurements,
+    rate: jax.Array,
+    noise: jax.Array,
+    background: jax.Array,
+    variance: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Posterior of the Gaussian process on the map's cells.
 
@@ -196,8 +209,8 @@ def posterior(
         variance: [] prior variance.
 
     Returns:
-        mean [ny, nx]; variance [ny, nx]; gain [ny, nx], the response of the mean to a unit step of all samples; and the part
-        [ny, nx] of the mean's variance that comes from the noise of the samples.
+        mean [ny, nx]; variance [ny, nx]; gain [ny, nx], the response of the mean to a unit step of all samples; and
+        the part [ny, nx] of the mean's variance that comes from the noise of the samples.
     """
     rank = params.columns.shape[1]
     pad = -m.valid.shape[0] % CHUNK
@@ -208,7 +221,9 @@ def posterior(
     kernels = _kernels(params, m)
     inputs = jax.tree.map(chunked, (*kernels, m.valid, rate - background, noise))
 
-    def accumulate(carry: tuple[jax.Array, jax.Array], x: tuple[jax.Array, ...]) -> tuple[tuple[jax.Array, jax.Array], None]:
+    Carry = tuple[jax.Array, jax.Array]
+
+    def accumulate(carry: Carry, x: tuple[jax.Array, ...]) -> tuple[Carry, None]:
         kx, ky, valid, excess, noise = x
         basis = (kx @ params.project_x) * (ky @ params.project_y)
         missed = jnp.maximum(1.0 - jnp.sum(basis * basis, axis=1), 0.0)
@@ -239,10 +254,11 @@ def posterior(
 def _significance(excess: jax.Array, gain: jax.Array, noise_var: jax.Array, background: jax.Array) -> jax.Array:
     """Signed root of the Poisson deviance between each cell's effective counts and the background's.
 
-    The mean is linear in the counts. Divided by its gain it is an unbiased estimate of a level excess with variance noise_var /
-    gain², which is that of a counter exposed for background gain² / noise_var seconds. The signed root of that counter's deviance
-    2 (n log(n/b) - n + b) is standard normal under bare background to a higher order than (n - b) / sqrt(b), whose skewness would
-    double the false alarms at 5 sigma already with 900 counts (McCullagh & Nelder 1989, section 2.4.2 and appendix C).
+    The mean is linear in the counts. Divided by its gain it is an unbiased estimate of a level excess with variance
+    noise_var / gain², which is that of a counter exposed for background gain² / noise_var seconds. The signed root of
+    that counter's deviance 2 (n log(n/b) - n + b) is standard normal under bare background to a higher order than (n
+    - b) / sqrt(b), whose skewness would double the false alarms at 5 sigma already with 900 counts (McCullagh &
+    Nelder 1989, section 2.4.2 and appendix C).
     """
     known = (gain > 0.1) & (noise_var > 0.0) & (background > 0.0)
     level = jnp.maximum(background, 1e-6)

@@ -14,9 +14,13 @@ def consumer(mission_key: jax.Array, name: str) -> jax.Array:
     return jax.random.fold_in(mission_key, zlib.crc32(name.encode()) & 0x7FFFFFFF)
 
 
-def normals(key: jax.Array, ticks: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Standard normal numbers [T, *shape] of the ticks numbered ``ticks`` [T], independent of how ticks are grouped."""
-    return jax.vmap(lambda tick: jax.random.normal(jax.random.fold_in(key, tick), shape))(ticks)
+def per_tick(key: jax.Array, ticks: jax.Array, vehicles: int) -> jax.Array:
+    """Keys [T, vehicles] for the ticks numbered ``ticks`` [T], independent of how ticks are grouped."""
+
+    def one(tick: jax.Array, vehicle: jax.Array) -> jax.Array:
+        return jax.random.fold_in(jax.random.fold_in(key, tick), vehicle)
+
+    return jax.vmap(lambda tick: jax.vmap(lambda vehicle: one(tick, vehicle))(jnp.arange(vehicles)))(ticks)
 
 
 def mission_keys(seeds: jax.Array) -> jax.Array:

@@ -38,8 +38,8 @@ class SilentProgress:
 class RichProgress:
     """A bar on the terminal for each phase; a context manager, so that the terminal is left as it was.
 
-    The speed is simulated time (of all ``missions`` together) over wall time since the first segment of the phase ended:
-    the first one holds the compilation.
+    The speed is simulated time (of all ``missions`` together) over wall time since the first segment of the phase
+    ended: the first one may hold the compilation.
     """
 
     def __init__(self, console: Console | None = None, missions: int = 1):

@@ -1,6 +1,6 @@
-"""What one flown mission leaves behind, as numpy arrays on the host: the input of everything that is written or shown."""
+"""What one flown mission leaves behind, as numpy arrays on the host: the input of all that is written or shown."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,9 @@ class Samples:
 
     def until(self, time_s: float) -> "Samples":
         """Those that had ended at ``time_s``."""
-        return Samples(*(getattr(self, f)[: np.searchsorted(self.time_s, time_s, "right")] for f in self.__dataclass_fields__))
+        return Samples(
+            *(getattr(self, f)[: np.searchsorted(self.time_s, time_s, "right")] for f in self.__dataclass_fields__)
+        )
 
 
 @dataclass(frozen=True)
@@ -172,3 +174,16 @@ class MissionRecord:
     route_m: Floats  # [r, 3] planned route of the rover
     events: tuple[Event, ...]
     finding: str  # one sentence: what the mission found
+
+    def finite(self) -> "MissionRecord":
+        """The mission without rows that are not finite: what a vehicle lost to a numerical failure left behind."""
+        vehicles = []
+        for vehicle in self.vehicles:
+            state = np.concatenate([vehicle.position_m, vehicle.quaternion, vehicle.velocity_m_s], axis=1)
+            keep = np.isfinite(state).all(axis=1) & np.isfinite(vehicle.energy_wh)
+            columns = ("time_s", "position_m", "quaternion", "velocity_m_s", "energy_wh", "battery_fraction")
+            vehicles.append(replace(vehicle, **{name: getattr(vehicle, name)[keep] for name in columns}))
+        samples = self.samples
+        whole = np.isfinite(samples.position_m).all(axis=1) & np.isfinite(samples.counts)
+        kept = Samples(*(getattr(samples, f)[whole] for f in samples.__dataclass_fields__))
+        return replace(self, vehicles=tuple(vehicles), samples=kept)

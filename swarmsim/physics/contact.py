@@ -47,16 +47,14 @@ def contact_wrench(
 
     Normal: a spring with a damper that never pulls. Tangential: Coulomb friction regularised by a spring that gives way
     at the friction cone (Cundall and Strack, "A discrete numerical model for granular assemblies", Géotechnique 29(1),
-    1979), so that a vehicle on a slope rests and does not creep, as it would on a viscous regularisation. The tangential
-    damper is the normal one times the ratio of the stiffnesses.
+    1979), so that a vehicle on a slope rests and does not creep, as it would on a viscous regularisation. The
+    tangential damper is the normal one times the ratio of the stiffnesses.
     """
     w = angular_velocity_rad_s
     velocity = velocity_m_s + _cross(w, points.position_m)
     closing = jnp.sum(velocity * normal, axis=-1)
     touching = height_m < 0.0
-    push = jnp.where(
-        touching, jnp.maximum(-points.stiffness_n_m * height_m - points.damping_n_s_m * closing, 0.0), 0.0
-    )
+    push = jnp.where(touching, jnp.maximum(-points.stiffness_n_m * height_m - points.damping_n_s_m * closing, 0.0), 0.0)
     along = velocity - closing[:, None] * normal
     give = slip_m - jnp.sum(slip_m * normal, axis=-1, keepdims=True) * normal + dt * along
     ratio = points.tangential_n_m / points.stiffness_n_m

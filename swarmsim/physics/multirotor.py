@@ -36,6 +36,7 @@ class Loads:
     torque_nm: jax.Array  # [3] N m, body
     rotor_speed_rad_s: jax.Array  # [R] rad/s at the end of the step
     contact_slip_m: jax.Array  # [C, 3] m, body, at the end of the step
+    ground_force_n: jax.Array  # [] N along the ground's normal
     power_w: jax.Array  # [] W from the battery
 
 
@@ -60,13 +61,18 @@ def make_multirotor_step(spec: Multirotor, engine: Engine, dt: float) -> Step:
     integrate = engines[engine](spec, dt)
 
     def step(
-        params: MultirotorParams, state: MultirotorState, rotor_command_rad_s: jax.Array, wind_m_s: jax.Array, ground: Plane
+        params: MultirotorParams,
+        state: MultirotorState,
+        rotor_command_rad_s: jax.Array,
+        wind_m_s: jax.Array,
+        ground: Plane,
     ) -> MultirotorState:
         loads = step_loads(params, state, rotor_command_rad_s, wind_m_s, ground, dt)
         return MultirotorState(
             body=integrate(params, state.body, loads.force_n, loads.torque_nm),
             rotor_speed_rad_s=loads.rotor_speed_rad_s,
             contact_slip_m=loads.contact_slip_m,
+            ground_force_n=loads.ground_force_n,
             energy_j=state.energy_j + dt * loads.power_w,
         )
 
@@ -113,6 +119,7 @@ def step_loads(
         torque_nm=air_torque + ground_torque,
         rotor_speed_rad_s=speed,
         contact_slip_m=slip,
+        ground_force_n=jnp.sum(ground_force * normal),
         power_w=battery_power(params, speed_before_rad_s=state.rotor_speed_rad_s, speed_after_rad_s=speed, dt=dt),
     )
 
@@ -148,6 +155,7 @@ def rest_state(params: MultirotorParams, ground: Plane, yaw_rad: jax.Array) -> M
         ),
         rotor_speed_rad_s=jnp.zeros_like(params.rotor_spin),
         contact_slip_m=jnp.zeros_like(params.contact_position_m),
+        ground_force_n=params.mass_kg * GRAVITY_M_S2 * ground.normal[2],
         energy_j=jnp.zeros(()),
     )
 

@@ -30,12 +30,19 @@ def to_body(matrix: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def free_body_step(
-    body: RigidState, *, mass_kg: jax.Array, inertia_kg_m2: jax.Array, force_n: jax.Array, torque_nm: jax.Array, dt: float
+    body: RigidState,
+    *,
+    mass_kg: jax.Array,
+    inertia_kg_m2: jax.Array,
+    force_n: jax.Array,
+    torque_nm: jax.Array,
+    dt: float,
 ) -> RigidState:
     """The body ``dt`` s later under gravity, ``force_n`` [3] (world) and ``torque_nm`` [3] (body).
 
-    The scheme is MuJoCo's semi-implicit Euler: velocities first, with the gyroscopic term of the old ones; then the pose
-    with the new velocities, the attitude by the exponential map. ``inertia_kg_m2`` [3] is principal along the body axes.
+    The scheme is MuJoCo's semi-implicit Euler: velocities first, with the gyroscopic term of the old ones; then the
+    pose with the new velocities, the attitude by the exponential map. ``inertia_kg_m2`` [3] is principal along the
+    body axes.
     """
     w = body.angular_velocity_rad_s
     momentum = inertia_kg_m2 * w

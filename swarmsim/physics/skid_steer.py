@@ -10,7 +10,7 @@ from swarmsim.config.vehicles import SkidSteer
 from swarmsim.physics import rotations, wheel_contact, wheels
 from swarmsim.physics.skid_steer_analytic import analytic_step
 from swarmsim.site import Site, sample_with_gradient
-from swarmsim.vehicles.skid_steer import RoverBody, SkidSteerParams, skid_steer_mjcf
+from swarmsim.vehicles.skid_steer import RoverBody, SkidSteerParams, rover_body
 from swarmsim.vehicles.state import RigidState, SkidSteerState
 
 NEWTON_ITERATIONS = 4
@@ -29,7 +29,7 @@ def make_skid_steer_step(
     """
     if engine == "mjx":
         problem = wheel_contact.contact_problem(
-            skid_steer_mjcf(spec, body, dt), NEWTON_ITERATIONS, LINE_SEARCH_ITERATIONS
+            spec, body or rover_body(spec), dt, NEWTON_ITERATIONS, LINE_SEARCH_ITERATIONS
         )
         return lambda params, state, command, site: mjx_step(problem, dt, params, state, command, site)
     if engine == "analytic":
@@ -46,7 +46,7 @@ def rest_state(params: SkidSteerParams, site: Site, xy: jax.Array, yaw: jax.Arra
     height, slope = sample_with_gradient(site.terrain_m, site, xy)
     quaternion = wheels.stand_on(slope, jnp.asarray(yaw, jnp.float32))
     up = jax.lax.rsqrt(1.0 + jnp.sum(slope * slope))
-    drop = params.wheel_radius_m - jnp.mean(params.wheel_position_m[:, 2])
+    drop = params.wheel_radius_m - params.tyre_sinkage_m - jnp.mean(params.wheel_position_m[:, 2])
     zero3, zero4 = jnp.zeros(3), jnp.zeros(4)
     body = RigidState(
         position_m=jnp.append(xy, height + drop / up),

@@ -5,8 +5,7 @@ frame and about the centre of mass, where the mass matrix of a chassis with four
 accelerations, contact points, their Jacobian and reference accelerations. The contact problem itself goes to
 `mjx.solve`. A test holds accelerations to those of MuJoCo on the same MJCF.
 
-Friction is MuJoCo's pyramid of four edges with one edge laid along the present slip of each tyre: a sliding tyre then has
-Coulomb friction against its slip, of the same size in all directions, for less than the elliptic cone costs.
+Friction cones are elliptic: Coulomb friction against the slip, of the same size in all directions.
 """
 
 from dataclasses import dataclass
@@ -15,43 +14,45 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from mujoco import mjx
 
-from swarmsim.vehicles.skid_steer import SkidSteerParams
+from swarmsim.config.vehicles import SkidSteer
+from swarmsim.vehicles.skid_steer import (
+    FRICTION_RATIO,
+    IMPEDANCE,
+    SLIP_DAMPING_1_S,
+    RoverBody,
+    SkidSteerParams,
+    skid_steer_mjcf,
+    tyre_constants,
+    wheel_inverse_mass,
+)
 
-SLIP_ONSET_M_S = 1e-3  # below this slip the pyramid's edge lies along the wheel
 DOFS = 10  # linear and angular acceleration in the body frame, four wheels
 
 
 @dataclass(frozen=True)
 class ContactProblem:
-    """Compiled model and what of it is constant: impedance and softness of the tyre's contact."""
+    """Compiled model and the constants of its tyre contact."""
 
     model: Any  # mjx.Model
     data: Any  # mjx.Data, template
-    softness: float  # body_invweight0 of a wheel times the rover's mass
-    impedance: tuple[float, float, float, float]  # solimp: dmin, dmax, width, power (midpoint 0.5)
-    stiffness_1_s2: float  # k of the reference acceleration -b v - k r
-    damping_1_s: float  # b
+    softness: float  # inverse mass of a wheel's centre times the rover's mass
+    stiffness_1_s2: float  # k of the reference acceleration -b v - k d r
+    damping_1_s: float  # b of the normal
 
 
-def contact_problem(mjcf: str, iterations: int, line_search: int) -> ContactProblem:
-    """Compile ``mjcf`` (of `skid_steer_mjcf`) for MJX's Newton solver."""
-    compiled = mujoco.MjModel.from_xml_string(mjcf)
-    compiled.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+def contact_problem(spec: SkidSteer, body: RoverBody, dt: float, iterations: int, line_search: int) -> ContactProblem:
+    """Compile the rover for MJX's Newton solver with so many iterations, each with so many steps of line search."""
+    compiled = mujoco.MjModel.from_xml_string(skid_steer_mjcf(spec, body, dt))
     compiled.opt.iterations, compiled.opt.ls_iterations = iterations, line_search
-    wheel = int(np.argmax(compiled.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE))
-    time_constant, damping_ratio = compiled.geom_solref[wheel]
-    time_constant = max(time_constant, 2.0 * compiled.opt.timestep)
-    low, high, width, _, power = compiled.geom_solimp[wheel]
+    stiffness, damping = tyre_constants(spec, body)
     return ContactProblem(
         model=mjx.put_model(compiled),
         data=mjx.make_data(compiled),
-        softness=float(compiled.body_invweight0[compiled.geom_bodyid[wheel], 0] * compiled.body_subtreemass[0]),
-        impedance=(float(low), float(high), float(width), float(power)),
-        stiffness_1_s2=float(1.0 / (high * time_constant * damping_ratio) ** 2),
-        damping_1_s=float(2.0 / (high * time_constant)),
+        softness=wheel_inverse_mass(spec, body) * body.mass_kg,
+        stiffness_1_s2=stiffness,
+        damping_1_s=damping,
     )
 
 
@@ -68,14 +69,16 @@ def smooth_force(
 ) -> jax.Array:
     """Generalised force [10] less the gyroscopic one; ``force`` and ``moment`` [3] in the body frame, gravity included."""
     spin = twist[3:6]
-    momentum = params.inertia_kg_m2 @ spin + params.wheel_inertia_kg_m2 * jnp.sum(twist[6:]) * jnp.array([0.0, 1.0, 0.0])
+    momentum = params.inertia_kg_m2 @ spin + params.wheel_inertia_kg_m2 * jnp.sum(twist[6:]) * jnp.array(
+        [0.0, 1.0, 0.0]
+    )
     return jnp.concatenate([force, moment - jnp.cross(spin, momentum), wheel_torque])
 
 
 def contact_rows(
     problem: ContactProblem, params: SkidSteerParams, twist: jax.Array, distance: jax.Array, normal: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Jacobian [16, 10], inverse softness [16] and reference acceleration [16] of the pyramids' edges.
+    """Jacobian [4, 3, 10], inverse softness [3] and reference acceleration [4, 3] along normal, rolling and side direction.
 
     ``twist`` [10] is the velocity, ``distance`` [4] (m) that of each tyre from its plane, negative in it, ``normal`` [4, 3]
     the planes' normals in the body frame. Formulas: MuJoCo documentation, "Computation", constraint model.
@@ -83,34 +86,17 @@ def contact_rows(
     reach = params.wheel_radius_m + 0.5 * distance
     arm = params.wheel_position_m - normal * reach[:, None]
     planar = jax.lax.rsqrt(normal[:, 0] ** 2 + normal[:, 2] ** 2)
-    zero = jnp.zeros_like(planar)
-    ahead = jnp.stack([normal[:, 2] * planar, zero, -normal[:, 0] * planar], axis=-1)
-    aside = jnp.cross(normal, ahead)
-    rolling = -reach / planar
-    velocity = twist[:3] + jnp.cross(twist[3:6], arm)
-    slip_ahead = jnp.sum(ahead * velocity, axis=-1) + rolling * twist[6:]
-    slip_aside = jnp.sum(aside * velocity, axis=-1)
-    slip_ahead = slip_ahead + jnp.where(slip_ahead < 0.0, -SLIP_ONSET_M_S, SLIP_ONSET_M_S)
-    slip = jax.lax.rsqrt(slip_ahead**2 + slip_aside**2)
-    c, s = slip_ahead * slip, slip_aside * slip
-    along = c[:, None] * ahead + s[:, None] * aside
-    across = c[:, None] * aside - s[:, None] * ahead
-    mu = params.friction
-    edges = jnp.stack([normal + mu * along, normal - mu * along, normal + mu * across, normal - mu * across], axis=1)
-    turning = mu * rolling[:, None] * jnp.stack([c, -c, -s, s], axis=1)
-    angular = jnp.cross(arm[:, None, :], edges)
-    own_wheel = turning[:, :, None] * jnp.eye(4)[:, None, :]
-    jacobian = jnp.concatenate([edges, angular, own_wheel], axis=-1)
-    jacobian = jnp.where(distance[:, None, None] < 0.0, jacobian, 0.0).reshape(16, DOFS)
-    low, high, width, power = problem.impedance
-    depth = jnp.minimum(jnp.abs(distance) / width, 1.0)
-    half = 0.5 ** (power - 1.0)
-    rise = jnp.where(depth < 0.5, depth**power / half, 1.0 - (1.0 - depth) ** power / half)
-    stiff = low + rise * (high - low)
-    softness = problem.softness / params.mass_kg * (1.0 + mu * mu) * 2.0 * mu * mu
-    resistance = softness * (1.0 - stiff) / stiff
-    pull = jnp.repeat(problem.stiffness_1_s2 * stiff * jnp.minimum(distance, 0.0), 4)
-    return jacobian, jnp.repeat(1.0 / resistance, 4), -problem.damping_1_s * (jacobian @ twist) - pull
+    ahead = jnp.stack([normal[:, 2] * planar, jnp.zeros(4), -normal[:, 0] * planar], axis=-1)
+    axes = jnp.stack([normal, ahead, jnp.cross(normal, ahead)], axis=1)
+    rolling = (-reach / planar)[:, None, None] * jnp.array([0.0, 1.0, 0.0])[:, None] * jnp.eye(4)[:, None, :]
+    jacobian = jnp.concatenate([axes, jnp.cross(arm[:, None, :], axes), rolling], axis=-1)
+    touching = (distance < 0.0)[:, None]
+    jacobian = jnp.where(touching[..., None], jacobian, 0.0)
+    damping = jnp.array([problem.damping_1_s, SLIP_DAMPING_1_S, SLIP_DAMPING_1_S])
+    spring = problem.stiffness_1_s2 * IMPEDANCE * distance[:, None] * jnp.array([1.0, 0.0, 0.0])
+    reference = -damping * (jacobian @ twist) - jnp.where(touching, spring, 0.0)
+    normal_mass = params.mass_kg / problem.softness * IMPEDANCE / (1.0 - IMPEDANCE)
+    return jacobian, normal_mass * jnp.array([1.0, FRICTION_RATIO, FRICTION_RATIO]), reference
 
 
 def accelerations(
@@ -126,9 +112,10 @@ def accelerations(
     data = problem.data.tree_replace(
         {
             "_impl.M": mass_matrix(params),
-            "_impl.efc_J": jacobian,
-            "_impl.efc_D": inverse_softness,
-            "_impl.efc_aref": reference,
+            "_impl.efc_J": jacobian.reshape(12, DOFS),
+            "_impl.efc_D": jnp.tile(inverse_softness, 4),
+            "_impl.efc_aref": reference.reshape(12),
+            "_impl.contact.friction": jnp.full((4, 5), params.friction),
             "qfrc_smooth": smooth,
             "qacc_smooth": free_acceleration(params, smooth),
             "qacc_warmstart": jnp.zeros(DOFS),

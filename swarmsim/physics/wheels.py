@@ -87,14 +87,17 @@ def impact_speed(params: SkidSteerParams, state: SkidSteerState, site: Site) -> 
 
 
 def stand_on(slope: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Quaternion [4] of a body that stands on ground of ``slope`` [2] (rise per metre along x, y) and heads along ``yaw`` [].
-
-    The heading is that of the forward axis seen from above.
-    """
+    """Quaternion [4] of a body on ground of ``slope`` [2] (rise per metre along x, y) heading ``yaw`` [] seen from above."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
-    climb = jnp.arctan(slope[0] * c + slope[1] * s)
-    bank = jnp.arctan((slope[1] * c - slope[0] * s) * jnp.cos(climb))
-    cy, sy, cp, sp, cr, sr = (f(0.5 * angle) for angle in (yaw, -climb, bank) for f in (jnp.cos, jnp.sin))
+    return attitude(slope[0] * c + slope[1] * s, slope[1] * c - slope[0] * s, yaw)
+
+
+def attitude(climb: jax.Array, bank: jax.Array, yaw: jax.Array) -> jax.Array:
+    """Quaternion [4] of a body on ground that rises by ``climb`` [] per metre ahead and ``bank`` [] per metre to the left."""
+    pitch = -jnp.arctan(climb)
+    roll = jnp.arctan(bank * jnp.cos(pitch))
+    half = 0.5 * jnp.stack([yaw, pitch, roll])
+    (cy, cp, cr), (sy, sp, sr) = jnp.cos(half), jnp.sin(half)
     return jnp.stack(
         [
             cy * cp * cr + sy * sp * sr,

@@ -57,8 +57,7 @@ def gust_scales(speed_m_s: jax.Array, height_m: jax.Array) -> tuple[jax.Array, j
 def gust_start(key: jax.Array) -> GustState:
     """Filters in their steady state, so that gusts do not build up from calm."""
     n = jax.random.normal(key, (5,))
-    along = jnp.sqrt(0.5) * n[0]
-    return GustState(along=jnp.sqrt(2.0) * along, across=_steady(n[1:3]), vertical=_steady(n[3:5]))
+    return GustState(along=n[0], across=_steady(n[1:3]), vertical=_steady(n[3:5]))
 
 
 def gust_step(
@@ -108,8 +107,8 @@ def _steady(n: jax.Array) -> jax.Array:
 def _second_order(x: jax.Array, passed: jax.Array, n: jax.Array) -> jax.Array:
     """Step of x1' = -x1 + white noise, x2' = x1 - x2 over the time ``passed`` (in units of L / V, at most 0.5).
 
-    The covariance gained is a quarter of incomplete gamma functions of 2 ``passed``; as differences from one they cancel
-    in float32 (to nothing below a ``passed`` of about 1e-3), so their power series are summed.
+    The covariance gained is a quarter of incomplete gamma functions of 2 ``passed``; as differences from one they
+    cancel in float32 (to nothing below a ``passed`` of about 1e-3), so their power series are summed.
     """
     keep = jnp.exp(-passed)
     t = 2.0 * passed

@@ -1,5 +1,7 @@
 """How the viewer opens a mission: the scene large, the map, the plots, the spectrum and the log around it."""
 
+from typing import Any
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -8,8 +10,9 @@ from swarmsim.missions.record import MissionRecord
 from swarmsim.site.model import SiteModel
 
 TIMELINE = "sim_time"
-BODY_SCALE = 4.0  # vehicles are drawn larger than life, or nobody would find them on a site of 150 m
-_BACKGROUND = [245, 246, 248]
+# Vehicles are drawn larger than life, or nobody would find them on a site of 150 m.
+BODY_SCALE = {"multirotor": 5.0, "skid_steer": 3.0}
+_BACKGROUND = [30, 33, 39]
 _PLAYBACK_SPEED = 10.0
 
 
@@ -27,29 +30,18 @@ def site_bounds(site_model: SiteModel) -> tuple[np.ndarray, np.ndarray]:
 def blueprint(record: MissionRecord, site_model: SiteModel) -> rrb.Blueprint:
     """The layout that is stored with the recording."""
     low, high = site_bounds(site_model)
-    centre = 0.5 * (low + high)
-    across = float(np.hypot(*(high - low)[:2]))
-    scene = rrb.Spatial3DView(
-        name="Mission",
-        origin="world",
-        background=rrb.Background(color=_BACKGROUND),
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=centre + across * np.array([-0.28, -0.56, 0.42]),
-            look_target=centre + [0.0, -0.04 * across, 0.0],
-            eye_up=[0.0, 0.0, 1.0],
-        ),
-        overrides=_growing(record),
-    )
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(scene, _plots(), row_shares=[3.0, 1.0]),
-            rrb.Vertical(_map(record, centre, high - low), _spectrum(), _texts(), row_shares=[1.5, 1.0, 1.0]),
+            rrb.Vertical(_scene(record, low, high), _plots(record), row_shares=[2.8, 1.0]),
+            rrb.Vertical(_map(record, low, high), _spectrum(record), _texts(), row_shares=[1.45, 1.0, 1.0]),
             column_shares=[2.1, 1.0],
         ),
         rrb.TimePanel(
-            state="collapsed", timeline=TIMELINE, playback_speed=_PLAYBACK_SPEED, play_state="following", loop_mode="off"
+            state="collapsed",
+            timeline=TIMELINE,
+            playback_speed=_PLAYBACK_SPEED,
+            play_state="following",
+            loop_mode="off",
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -58,55 +50,89 @@ def blueprint(record: MissionRecord, site_model: SiteModel) -> rrb.Blueprint:
     )
 
 
-def _growing(record: MissionRecord) -> dict[str, list[rrb.VisibleTimeRanges]]:
+def _growing(record: MissionRecord) -> dict[Any, rrb.VisibleTimeRanges]:
     """Trails and measurements show everything up to the time cursor; all else shows its latest state."""
     so_far = rrb.VisibleTimeRanges(
         timeline=TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
     parents = ("world/trails", "world/measurements/aerial", "world/measurements/ground")
-    return {path_of(parent, v.name): [so_far] for parent in parents for v in record.vehicles}
+    return {path_of(parent, v.name): so_far for parent in parents for v in record.vehicles}
 
 
-def _map(record: MissionRecord, centre: np.ndarray, size: np.ndarray) -> rrb.Spatial3DView:
-    """The scene from straight above, north up, without what is only a matter of height."""
-    eye = centre + [0.0, 0.0, 1.05 * max(size[1], 0.8 * size[0])]
+def _scene(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatial3DView:
+    """The site from the south, a little from the west, so that its longer side lies across the view."""
+    centre = 0.5 * (low + high)
+    across = float(np.hypot(*(high - low)[:2]))
     return rrb.Spatial3DView(
-        name="Map (north up)",
+        name="Mission",
         origin="world",
-        contents=["+ world/**", "- world/measurements/aerial/**"],
+        contents=["+ world/**"],
         background=rrb.Background(color=_BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=centre, eye_up=[0.0, 1.0, 0.0]
+            kind=rrb.Eye3DKind.Orbital,
+            position=centre + across * np.array([-0.10, -0.64, 0.47]),
+            look_target=centre + across * np.array([0.0, -0.08, 0.0]),
+            eye_up=[0.0, 0.0, 1.0],
         ),
         overrides=_growing(record),
     )
 
 
-def _plots() -> rrb.Container:
-    views = (
-        ("plots/aerial_rate", "Count rate, air [1/s]"),
-        ("plots/ground_rate", "Count rate, ground [1/s]"),
-        ("plots/battery", "Battery [%]"),
-        ("plots/height", "Height above ground [m]"),
+def _map(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatial3DView:
+    """The scene from straight above, north up, without the flown points that would hide the map."""
+    centre, size = 0.5 * (low + high), high - low
+    target = centre - [0.0, 0.04 * size[1], 0.0]  # room for the legend along the south edge
+    eye = target + np.array([0.0, 0.0, 1.2 * max(size[1], 0.7 * size[0])])
+    return rrb.Spatial3DView(
+        name="Map (north up)",
+        origin="world",
+        contents=["+ world/**", "- world/measurements/aerial/**", "- world/labels/**", "- world/legend/ground/**"],
+        background=rrb.Background(color=_BACKGROUND),
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=[0.0, 1.0, 0.0]
+        ),
+        overrides=_growing(record),
     )
-    made = {
-        origin: rrb.TimeSeriesView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=True))
-        for origin, name in views
-    }
+
+
+def _plots(record: MissionRecord) -> rrb.Container:
+    """Count rates and batteries against the time of the phase that they belong to."""
+    spans = {p.name: (p.start_s, p.end_s) for p in record.phases if p.end_s > p.start_s}
+    whole = (min(p.start_s for p in record.phases), max(p.end_s for p in record.phases))
+
+    def plot(origin: str, name: str, span: tuple[float, float]) -> rrb.TimeSeriesView:
+        start, end = (rrb.TimeRangeBoundary.absolute(seconds=s) for s in span)
+        return rrb.TimeSeriesView(
+            origin=origin,
+            name=name,
+            axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+        )
+
     return rrb.Horizontal(
-        made["plots/aerial_rate"],
-        made["plots/ground_rate"],
-        rrb.Tabs(made["plots/battery"], made["plots/height"]),
+        plot("plots/aerial_rate", "Count rate, air [1/s]", spans.get("aerial", whole)),
+        plot("plots/ground_rate", "Count rate, ground [1/s]", spans.get("ground", whole)),
+        rrb.Tabs(plot("plots/battery", "Battery [%]", whole), plot("plots/height", "Height above ground [m]", whole)),
     )
 
 
-def _spectrum() -> rrb.BarChartView:
-    return rrb.BarChartView(origin="spectrum", name="Spectrum (counts against keV)")
+def _spectrum(record: MissionRecord) -> rrb.View:
+    """Bars of the spectrum; a mission without one says so instead of showing empty axes."""
+    if record.spectrum is None:
+        return rrb.TextDocumentView(origin="spectrum", name="Spectrum")
+    return rrb.BarChartView(
+        origin="spectrum",
+        name=f"Spectrum (counts against keV), {record.spectrum.live_time_s:.0f} s live",
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+    )
 
 
 def _texts() -> rrb.Container:
-    return rrb.Tabs(
-        rrb.TextLogView(origin="log", name="Mission log"),
-        rrb.TextDocumentView(origin="summary", name="Summary"),
+    log = rrb.TextLogView(
+        origin="log",
+        name="Mission log",
+        columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"]),
     )
+    return rrb.Tabs(log, rrb.TextDocumentView(origin="summary", name="Summary"))

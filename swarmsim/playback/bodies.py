@@ -1,6 +1,6 @@
 """Simple solid bodies for the viewer: a multirotor of arms and rotor discs, a rover of a box and wheels."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ def shaded(
     colours: NDArray[np.uint8],
     crease_deg: float = 40.0,
 ) -> Mesh:
-    """Add normals [n, 3] to a mesh: smooth over gentle bends, with an edge where a face bends by more than ``crease_deg``.
+    """Add normals [n, 3] to a mesh: smooth over gentle bends, an edge where faces bend by more than ``crease_deg``.
 
     A vertex whose faces meet at such an edge is doubled, once for each face there.
     """
@@ -54,7 +54,7 @@ def shaded(
     flat = triangles.reshape(-1)
     summed = [np.bincount(flat, np.repeat(area[:, k], 3), len(vertices_m)) for k in range(3)]
     smooth = np.stack(summed, -1)
-    smooth /= np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
+    smooth = smooth / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-12)
     corner_face = np.repeat(face, 3, axis=0)
     sharp = np.flatnonzero((corner_face * smooth[flat]).sum(-1) < np.cos(np.radians(crease_deg)))
     indices = flat.astype(np.uint32)
@@ -69,11 +69,12 @@ def shaded(
 
 _Part = tuple[NDArray[np.floating], NDArray[np.integer], tuple[int, ...]]  # vertices [n, 3], triangles [t, 3], RGBA
 
-_BOX_CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))])
-_BOX_FACES = np.array(
-    [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4]]
-    + [[1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]]
+_BOX_CORNERS = np.array(
+    [[x, y, z] for z in (-0.5, 0.5) for x, y in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))]
 )
+_BOX_FACES = np.array(
+    [0, 2, 1, 0, 3, 2, 4, 5, 6, 4, 6, 7, 0, 1, 5, 0, 5, 4, 1, 2, 6, 1, 6, 5, 2, 3, 7, 2, 7, 6, 3, 0, 4, 3, 4, 7]
+).reshape(-1, 3)
 
 
 def _box(centre: NDArray[np.floating], size: NDArray[np.floating], colour: tuple[int, ...]) -> _Part:
@@ -132,27 +133,37 @@ def _multirotor(shape: Shape, colour: tuple[int, ...]) -> list[_Part]:
     for side in (-1.0, 1.0):
         foot = np.array([0.0, side * 0.75 * shape.box_size_m[1], bottom - 0.5 * radius])
         parts.append(_beam(np.array([0.0, side * 0.3 * shape.box_size_m[1], bottom]), foot, thickness, _DARK))
-        parts.append(_beam(foot - [0.9 * radius, 0, 0], foot + [0.9 * radius, 0, 0], thickness, _DARK))
+        reach = np.array([0.9 * radius, 0.0, 0.0])
+        parts.append(_beam(foot - reach, foot + reach, thickness, _DARK))
     parts.append(_cylinder(np.array([0.0, 0.0, bottom - 0.2 * radius]), 2, 0.15 * radius, 0.4 * radius, _GREY))
     return parts
 
 
 def _rover(shape: Shape, colour: tuple[int, ...]) -> list[_Part]:
     length, width, height = shape.box_size_m
-    top = shape.box_centre_m + [0.0, 0.0, 0.5 * height]
     parts = [_box(shape.box_centre_m, shape.box_size_m, colour)]
     for hub in shape.hubs_m:
         parts.append(_cylinder(hub, 1, shape.radius_m, shape.width_m, _DARK, sides=24))
         parts.append(_cylinder(hub, 1, 0.45 * shape.radius_m, 1.08 * shape.width_m, _LIGHT, sides=16))
-    parts.append(_box(top + [-0.1 * length, 0.0, 0.15 * height], np.array([0.5 * length, 0.7 * width, 0.3 * height]), _GREY))
-    mast = top + [0.32 * length, 0.0, 0.0]
-    parts.append(_beam(mast, mast + [0.0, 0.0, 1.2 * height], 0.06 * width, _DARK))
-    parts.append(_box(mast + [0.02, 0.0, 1.2 * height], np.array([0.16 * length, 0.3 * width, 0.25 * height]), _LIGHT))
+
+    def on_deck(x: float, z: float) -> NDArray[np.floating]:
+        """A point ``x`` lengths ahead of the deck's centre and ``z`` heights above it."""
+        return shape.box_centre_m + np.array([x * length, 0.0, (0.5 + z) * height])
+
+    parts.append(_box(on_deck(-0.1, 0.15), np.array([0.5 * length, 0.7 * width, 0.3 * height]), _GREY))
+    parts.append(_beam(on_deck(0.32, 0.0), on_deck(0.32, 1.2), 0.06 * width, _DARK))
+    parts.append(_box(on_deck(0.34, 1.2), np.array([0.16 * length, 0.3 * width, 0.25 * height]), _LIGHT))
     return parts
 
 
 def vehicle_mesh(vehicle: VehicleRecord, colour: str, scale: float = 1.0) -> Mesh:
-    """Body of a vehicle in its own frame (FLU), ``scale`` times life size, painted in ``colour`` (hex)."""
+    """Body of a vehicle in its own frame (FLU), ``scale`` times life size, painted in ``colour`` (hex).
+
+    It grows from its feet or wheels upwards, so that an enlarged vehicle still stands on the ground.
+    """
     shape = vehicle.shape or _GENERIC[vehicle.kind]
     build = _multirotor if vehicle.kind == "multirotor" else _rover
-    return _merge(build(shape, tuple(rgba(colour))), scale)
+    mesh = _merge(build(shape, tuple(rgba(colour))), scale)
+    lowest = float(mesh.vertices_m[:, 2].min()) / scale
+    raised = mesh.vertices_m - np.array([0.0, 0.0, (scale - 1.0) * lowest], np.float32)
+    return replace(mesh, vertices_m=raised)

@@ -1,4 +1,4 @@
-"""Colours of everything that is drawn: vehicles, count rates, and the marks of sources. Safe for colour-blind readers."""
+"""Colours of everything that is drawn: vehicles, count rates, marks of sources. Safe for colour-blind readers."""
 
 from dataclasses import dataclass
 

@@ -27,7 +27,7 @@ class MapGrid:
         """Two triangles [2 (ny-1) (nx-1), 3] for each square of four grid points, counter-clockwise from above."""
         nx, ny = len(self.x_m), len(self.y_m)
         corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).reshape(-1, 1)
-        return np.concatenate([corner + [0, 1, nx + 1], corner + [0, nx + 1, nx]]).astype(np.uint32)
+        return (corner + np.array([[0, 1, nx + 1, 0, nx + 1, nx]])).reshape(-1, 3).astype(np.uint32)
 
 
 def grid_of(radiation_map: RadiationMap) -> MapGrid:
@@ -39,7 +39,9 @@ def grid_of(radiation_map: RadiationMap) -> MapGrid:
     return MapGrid(x_m=x, y_m=y, stride=stride)
 
 
-def raster_at(raster: NDArray[np.floating], site: Site, x_m: NDArray[np.floating], y_m: NDArray[np.floating]) -> NDArray:
+def raster_at(
+    raster: NDArray[np.floating], site: Site, x_m: NDArray[np.floating], y_m: NDArray[np.floating]
+) -> NDArray:
     """Bilinear value [...] of a site's raster at ``x_m``, ``y_m`` [...] (ENU), clamped at the border."""
     cell = float(site.cell_m)
     origin = np.asarray(site.origin_m, float)
@@ -57,9 +59,9 @@ def drape(grid: MapGrid, site: Site, above_m: float) -> NDArray[np.float32]:
 def partial_map(samples: Samples, grid: MapGrid) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
     """Rate [ny, nx] in cps that ``samples`` show on ``grid``, and where they reach [ny, nx].
 
-    Kernel estimate: counts and exposures are spread by the same Gaussian and divided (Nadaraya 1964, Watson 1964), which
-    needs no more than two filters a picture. The mission's own map, interpolated with its own method, replaces it once
-    the survey is over.
+    Kernel estimate: counts and exposures are spread by the same Gaussian and divided (Nadaraya 1964, Watson 1964),
+    which needs no more than two filters a picture. The mission's own map, interpolated with its own method, replaces it
+    once the survey is over.
     """
     shape = (len(grid.y_m), len(grid.x_m))
     spacing = float(grid.x_m[1] - grid.x_m[0]) if shape[1] > 1 else 1.0
@@ -89,7 +91,7 @@ class Snapshot:
 
 
 def snapshots(record: MissionRecord, count: int) -> list[Snapshot]:
-    """``count`` growing maps over the survey and, last, the mission's own; none where nothing was measured from the air."""
+    """``count`` growing maps over the survey and, last, the mission's own; none if nothing was measured in flight."""
     aerial = record.samples.of_phase("aerial")
     if len(aerial.time_s) == 0:
         return []

@@ -30,6 +30,7 @@ from swarmsim.site.model import SiteModel
 POSE_RATE_HZ = 10.0
 TRAIL_RATE_HZ = 2.0
 MAP_SNAPSHOTS = 30
+SPECTRUM_BARS = 256  # as many as a quarter of a screen can show
 MAP_ABOVE_GROUND_M = 0.35
 MAP_OPACITY = 190  # of 255
 
@@ -39,6 +40,7 @@ def write_recording(record: MissionRecord, site_model: SiteModel, path: Path) ->
 
     Raises whatever Rerun finds wrong: the recording is complete, or there is an error.
     """
+    record = record.finite()
     with _strict():
         stream = rr.RecordingStream("swarmsim", recording_id=f"{record.name}-{record.seed}")
         stream.set_log_tick_enabled(False)
@@ -118,13 +120,14 @@ def _send_vehicle(stream: rr.RecordingStream, vehicle: VehicleRecord, colour: st
         _times(vehicle.time_s[keep]),
         rr.Transform3D.columns(translation=vehicle.position_m[keep], quaternion=xyzw),
     )
-    stream.log(f"{path}/body", _mesh(vehicle_mesh(vehicle, colour, BODY_SCALE)), static=True)
+    body = vehicle_mesh(vehicle, colour, BODY_SCALE[vehicle.kind])
+    stream.log(f"{path}/body", _mesh(body), static=True)
     stream.log(
         f"{path}/label",
         rr.Points3D(
-            [[0.0, 0.0, 0.5 * BODY_SCALE]],
+            [[0.0, 0.0, float(body.vertices_m[:, 2].max()) + 0.5]],
             radii=rr.Radius.ui_points(1.0),
-            colors=[rgba(colour)],
+            colors=[[255, 255, 255, 255]],
             labels=[vehicle.name],
             show_labels=True,
         ),
@@ -152,7 +155,9 @@ def _send_vehicle(stream: rr.RecordingStream, vehicle: VehicleRecord, colour: st
 def _send_vehicle_plots(stream: rr.RecordingStream, vehicle: VehicleRecord, colour: str, site_model: SiteModel) -> None:
     keep = _thinned(vehicle.time_s, TRAIL_RATE_HZ)
     position = vehicle.position_m[keep]
-    terrain = growing_map.raster_at(np.asarray(site_model.site.terrain_m), site_model.site, position[:, 0], position[:, 1])
+    terrain = growing_map.raster_at(
+        np.asarray(site_model.site.terrain_m), site_model.site, position[:, 0], position[:, 1]
+    )
     series = {"battery": 100.0 * vehicle.battery_fraction[keep], "height": position[:, 2] - terrain}
     for name, values in series.items():
         _send_series(stream, path_of(f"plots/{name}", vehicle.name), vehicle.name, colour, vehicle.time_s[keep], values)
@@ -246,23 +251,22 @@ def _send_spectrum(stream: rr.RecordingStream, record: MissionRecord) -> None:
     """
     spectrum = record.spectrum
     if spectrum is None:
+        note = rr.TextDocument("No spectrum: nothing was found to identify.", media_type="text/markdown")
+        stream.log("spectrum", note, static=True)
         return
-    end = next((p.end_s for p in record.phases if p.name == "ground"), record.phases[-1].end_s)
-    stream.set_time(TIMELINE, duration=float(end))
-    energy = spectrum.energy_kev
-    widths = np.full(len(energy), float(energy[1] - energy[0]))
-    bars = {
-        "measured": (spectrum.counts, "#56B4E9"),
-        f"fit: {spectrum.nuclide} + background": (spectrum.fit, "#000000"),
-    }
-    for name, (values, colour) in bars.items():
-        stream.log(
-            path_of("spectrum", name), rr.BarChart(values, abscissa=energy, widths=widths, color=rgba(colour))
+    stream.set_time(TIMELINE, duration=float(record.phases[-1].end_s))
+    merge = max(1, len(spectrum.counts) // SPECTRUM_BARS)
+    kept = len(spectrum.counts) // merge * merge
+    energy, counts, fit = (v[:kept].reshape(-1, merge) for v in (spectrum.energy_kev, spectrum.counts, spectrum.fit))
+    middle = energy.mean(axis=1)
+    width = float(middle[1] - middle[0])
+    for name, values, colour, share in (("measured", counts, "#56B4E9", 0.9), ("fit", fit, "#E69F00", 0.25)):
+        bars = rr.BarChart(
+            values.sum(axis=1), abscissa=middle, widths=[share * width] * len(middle), color=rgba(colour)
         )
+        stream.log(f"spectrum/{name}", bars)
+    height = 1.05 * float(counts.sum(axis=1).max())
     for line in spectrum.lines_kev:
-        height = float(spectrum.counts.max())
-        stream.log(
-            path_of("spectrum", f"{spectrum.nuclide} {line:.0f} keV"),
-            rr.BarChart([height], abscissa=[float(line)], widths=[2.0], color=rgba("#D55E00")),
-        )
+        mark = rr.BarChart([height], abscissa=[float(line)], widths=[0.4 * width], color=rgba("#D55E00"))
+        stream.log(path_of("spectrum", f"{spectrum.nuclide}_{line:.0f}_keV"), mark)
     stream.reset_time()

@@ -6,64 +6,75 @@ from numpy.typing import NDArray
 
 from swarmsim.missions.record import Estimate, MissionRecord
 from swarmsim.playback.blueprint import TIMELINE, site_bounds
-from swarmsim.playback.colours import ESTIMATE, HOTSPOT, TRUTH, RateScale, rgba
+from swarmsim.playback.colours import ESTIMATE, TRUTH, RateScale, rgba
 from swarmsim.playback.growing_map import raster_at
 from swarmsim.site.model import SiteModel
 
 CHI2_95_3 = 7.815  # 95 % quantile of chi-squared, 3 degrees of freedom (NIST/SEMATECH e-Handbook, table 1.3.6.7.4)
 _ROUTE_ABOVE_GROUND_M = 0.5
+_AERIAL_ESTIMATE = "#56B4E9"
+_ROUTE, _HOTSPOT, _LABEL = [240, 240, 240, 255], [255, 255, 255, 255], [255, 255, 255, 255]
 
 
 def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel) -> None:
-    """Truth from the start; hotspots, aerial estimate and route after the survey; the final estimate after the drive."""
+    """Truth from the start; hotspots, aerial estimate and route after the survey; final estimate after the drive."""
     for k, source in enumerate(record.sources):
-        _pin(stream, f"world/truth/{k}", source.position_m, 9.0, f"true {source.nuclide}, {source.activity_mbq:.0f} MBq", TRUTH)
+        label = f"true {source.nuclide}, {source.activity_mbq:.0f} MBq"
+        _pin(stream, f"truth/{k}", source.position_m, 7.0, label, TRUTH, static=True)
     survey_end = next((p.end_s for p in record.phases if p.name == "aerial"), 0.0)
     stream.set_time(TIMELINE, duration=float(survey_end))
     _hotspots_and_route(stream, record, site_model)
     if record.aerial_estimate is not None:
-        _estimate(stream, "world/estimate/aerial", record.aerial_estimate, "from the air", "#56B4E9", 14.0)
+        _estimate(stream, "estimate/aerial", record.aerial_estimate, "from the air", _AERIAL_ESTIMATE)
     stream.set_time(TIMELINE, duration=float(record.phases[-1].end_s))
     if record.estimate is not None:
-        _estimate(stream, "world/estimate/final", record.estimate, "final", ESTIMATE, 19.0)
+        _estimate(stream, "estimate/final", record.estimate, "final", ESTIMATE)
         # The first guess has served; two pins a metre apart only hide each other.
         stream.log("world/estimate/aerial/pin", rr.Clear(recursive=True))
+        stream.log("world/labels/estimate/aerial", rr.Clear(recursive=True))
     stream.reset_time()
 
 
 def _hotspots_and_route(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel) -> None:
+    thin = rr.Radius.ui_points(1.5)
     if len(record.map.hotspots_m):
         x, y = record.map.hotspots_m.T
         z = raster_at(np.asarray(site_model.site.terrain_m), site_model.site, x, y) + _ROUTE_ABOVE_GROUND_M
         angle = np.linspace(0.0, 2.0 * np.pi, 40)
-        rings = [
-            np.stack([a + 2.5 * np.cos(angle), b + 2.5 * np.sin(angle), np.full(40, c)], -1) for a, b, c in zip(x, y, z, strict=True)
-        ]
-        stream.log("world/hotspots", rr.LineStrips3D(rings, colors=[rgba(HOTSPOT)], radii=rr.Radius.ui_points(1.5)))
+        ring = 2.5 * np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], -1)
+        rings = list(np.stack([x, y, z], -1)[:, None] + ring)
+        stream.log("world/hotspots", rr.LineStrips3D(rings, colors=[_HOTSPOT], radii=thin))
     if len(record.route_m) > 1:
-        lifted = record.route_m + [0.0, 0.0, _ROUTE_ABOVE_GROUND_M]
-        stream.log("world/route", rr.LineStrips3D([lifted], colors=[[40, 40, 40, 255]], radii=rr.Radius.ui_points(1.5)))
+        lifted = record.route_m + np.array([0.0, 0.0, _ROUTE_ABOVE_GROUND_M])
+        stream.log("world/route", rr.LineStrips3D([lifted], colors=[_ROUTE], radii=thin))
 
 
 def _pin(
-    stream: rr.RecordingStream, path: str, position_m: NDArray[np.floating], height_m: float, label: str, colour: str,
-    static: bool = True,
+    stream: rr.RecordingStream,
+    path: str,
+    position_m: NDArray[np.floating],
+    height_m: float,
+    label: str,
+    colour: str,
+    static: bool,
 ) -> None:
     """A point with a mast and a label on top, so that it is found from afar and behind buildings."""
-    top = np.asarray(position_m, float) + [0.0, 0.0, height_m]
-    stream.log(f"{path}/mast", rr.LineStrips3D([[position_m, top]], colors=[rgba(colour)], radii=rr.Radius.ui_points(1.5)), static=static)
-    stream.log(f"{path}/place", rr.Points3D([position_m], radii=[0.4], colors=[rgba(colour)]), static=static)
+    top = np.asarray(position_m, float) + np.array([0.0, 0.0, height_m])
+    paint = [rgba(colour)]
+    mast = rr.LineStrips3D([[position_m, top]], colors=paint, radii=rr.Radius.ui_points(1.5))
+    stream.log(f"world/{path}/pin/mast", mast, static=static)
+    stream.log(f"world/{path}/pin/place", rr.Points3D([position_m], radii=[0.4], colors=paint), static=static)
     stream.log(
-        f"{path}/label",
-        rr.Points3D([top], radii=rr.Radius.ui_points(4.0), colors=[rgba(colour)], labels=[label], show_labels=True),
-        static=static,
+        f"world/{path}/pin/head", rr.Points3D([top], radii=rr.Radius.ui_points(4.0), colors=paint), static=static
     )
+    label_point = rr.Points3D([top], radii=rr.Radius.ui_points(0.5), colors=[_LABEL], labels=[label], show_labels=True)
+    stream.log(f"world/labels/{path}", label_point, static=static)
 
 
-def _estimate(stream: rr.RecordingStream, path: str, estimate: Estimate, name: str, colour: str, height_m: float) -> None:
+def _estimate(stream: rr.RecordingStream, path: str, estimate: Estimate, name: str, colour: str) -> None:
     half_sizes, quaternion = ellipsoid(estimate.covariance_m2)
     stream.log(
-        f"{path}/ellipsoid",
+        f"world/{path}/ellipsoid",
         rr.Ellipsoids3D(
             centers=[estimate.position_m],
             half_sizes=[half_sizes],
@@ -72,8 +83,8 @@ def _estimate(stream: rr.RecordingStream, path: str, estimate: Estimate, name: s
             fill_mode="solid",
         ),
     )
-    label = f"estimate {name}: {estimate.activity_mbq:.0f} ± {estimate.activity_std_mbq:.0f} MBq"
-    _pin(stream, f"{path}/pin", estimate.position_m, height_m, label, colour, static=False)
+    label = f"{name} estimate, {estimate.activity_mbq:.0f} ± {estimate.activity_std_mbq:.0f} MBq"
+    _pin(stream, path, estimate.position_m, 15.0, label, colour, static=False)
 
 
 def ellipsoid(covariance_m2: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
@@ -85,7 +96,7 @@ def ellipsoid(covariance_m2: NDArray[np.floating]) -> tuple[NDArray[np.floating]
 
 
 def quaternion_of(matrix: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Quaternion [4] (x y z w) of a rotation matrix [3, 3]: eigenvector of Bar-Itzhack's matrix (J. Guidance 23, 2000)."""
+    """Quaternion [4] (x y z w) of a rotation matrix [3, 3], by Bar-Itzhack (J. Guidance 23, 2000)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.asarray(matrix, float)
     k = np.array(
         [
@@ -101,25 +112,31 @@ def quaternion_of(matrix: NDArray[np.floating]) -> NDArray[np.floating]:
 def send_legend(
     stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel, scales: dict[str, RateScale]
 ) -> None:
-    """A row of coloured blocks with their count rates along the site's south edge for each phase's colour scale."""
+    """A bar of coloured blocks with count rates at its ends, along the site's south edge, for each colour scale."""
     low, high = site_bounds(site_model)
-    step = (high[0] - low[0]) / 24.0
+    length, count = 0.30 * (high[0] - low[0]), 16
+    block = length / count
     for row, (phase, scale) in enumerate(scales.items()):
         if len(record.samples.of_phase(phase).time_s) == 0:
             continue
-        count = 8
         rates = np.asarray(scale.norm.inverse(np.linspace(0.0, 1.0, count)), float)
-        start = low[0] + (1.0 + 12.0 * row) * step
-        centres = np.array([[start + (k + 0.5) * step, low[1] - 1.5 * step, low[2]] for k in range(count)])
-        ends = f"{phase} {rates[0]:.0f} cps", f"{rates[-1]:.0f} cps"
+        start = np.array([low[0] + (0.1 + 0.5 * row) * (high[0] - low[0]), low[1] - 2.5 * block, low[2]])
+        centres = start + np.arange(count)[:, None] * [block, 0.0, 0.0]
         stream.log(
-            f"world/legend/{phase}",
+            f"world/legend/{phase}/scale",
             rr.Boxes3D(
-                centers=centres,
-                half_sizes=[[0.5 * step, 0.5 * step, 0.1]],
-                colors=scale(rates),
-                fill_mode="solid",
-                labels=[ends[0], *[""] * (count - 2), ends[1]],
+                centers=centres, half_sizes=[[0.5 * block] * 2 + [0.05]], colors=scale(rates), fill_mode="solid"
+            ),
+            static=True,
+        )
+        name = {"aerial": "air", "ground": "ground"}[phase]
+        stream.log(
+            f"world/legend/{phase}/ends",
+            rr.Points3D(
+                centres[[0, -1]],
+                radii=rr.Radius.ui_points(0.5),
+                colors=[_LABEL],
+                labels=[f"{name}: {rates[0]:.0f} cps", f"{rates[-1]:.0f} cps"],
                 show_labels=True,
             ),
             static=True,

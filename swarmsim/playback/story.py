@@ -5,6 +5,7 @@ import rerun as rr
 
 from swarmsim.missions.record import Estimate, MissionRecord
 from swarmsim.playback.blueprint import BODY_SCALE, TIMELINE
+from swarmsim.playback.spectrum_figure import confidence_text
 
 _LEVEL = {"crash": "ERROR", "collision": "ERROR", "non_finite": "ERROR", "battery_empty": "WARN"}
 
@@ -29,7 +30,7 @@ def story(record: MissionRecord) -> list[tuple[float, str, str]]:
         if estimate is not None:
             lines.append((when, "INFO", f"{name}: {describe(estimate)}"))
     if record.spectrum is not None:
-        named = f"{record.spectrum.nuclide} with confidence {record.spectrum.confidence:.3f}"
+        named = f"{record.spectrum.nuclide} with confidence {confidence_text(record.spectrum)}"
         lines.append((end, "INFO", f"spectrum of {record.spectrum.live_time_s:.0f} s live: {named}"))
     lines.append((end, "INFO", record.finding))
     return sorted(lines, key=lambda line: line[0])
@@ -57,11 +58,13 @@ def send_log(stream: rr.RecordingStream, record: MissionRecord) -> None:
 def page(record: MissionRecord) -> str:
     """The mission on one page, in Markdown."""
     team = "\n".join(
-        f"| {v.name} | {v.type} | {float(v.energy_wh[-1]):.1f} | {'crashed' if v.crashed else 'ok'} |" for v in record.vehicles
+        f"| {v.name} | {v.type} | {v.energy_wh[-1] if len(v.energy_wh) else 0.0:.1f} | {'crashed' if v.crashed else 'ok'} |"
+        for v in record.vehicles
     )
     truth = "\n".join(
         f"- true: {s.nuclide}, {s.activity_mbq:.0f} MBq at "
-        f"{s.position_m[0]:.1f} m east, {s.position_m[1]:.1f} m north, {s.position_m[2]:.1f} m up" for s in record.sources
+        f"{s.position_m[0]:.1f} m east, {s.position_m[1]:.1f} m north, {s.position_m[2]:.1f} m up"
+        for s in record.sources
     )
     found = "\n".join(
         f"- {name}: {describe(estimate)}"
@@ -71,7 +74,8 @@ def page(record: MissionRecord) -> str:
     return (
         f"# {record.name}\n\nSite {record.site}, seed {record.seed}\n\n**{record.finding}**\n\n{truth}\n{found}\n\n"
         f"| vehicle | type | energy [Wh] | |\n|---|---|---|---|\n{team}\n\n"
-        f"Vehicles are drawn {BODY_SCALE:g} times life size. Points are coloured by the count rate averaged over 1 s; "
+        f"Drawn larger than life: multirotors {BODY_SCALE['multirotor']:g} times, rovers {BODY_SCALE['skid_steer']:g} "
+        "times. Points are coloured by the count rate averaged over 1 s; "
         "ellipsoids hold 95 %.\n"
     )
 

@@ -1,1 +1,26 @@
-"""Gamma radiation: nuclides, attenuation, detector response, spectra and identification."""
+"""Gamma radiation: nuclides, attenuation and build-up, detector response, counts, spectra and identification.
+
+A nuclide, a material or a detector is a file in ``configs``; nothing here names one, apart from air.
+"""
+
+from swarmsim.radiation.detector import KINDS, Detector, Source, build_detector, restrict
+from swarmsim.radiation.identify import Identification, identify
+from swarmsim.radiation.library import Library, load_library
+from swarmsim.radiation.rate import draw_counts, line_rates, net_rate, observed_rate, spectrum_rate
+
+__all__ = [
+    "KINDS",
+    "Detector",
+    "Identification",
+    "Library",
+    "Source",
+    "build_detector",
+    "draw_counts",
+    "identify",
+    "line_rates",
+    "load_library",
+    "net_rate",
+    "observed_rate",
+    "restrict",
+    "spectrum_rate",
+]

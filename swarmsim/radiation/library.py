@@ -14,6 +14,7 @@ from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.radiation import Material, Nuclide
 
 Floats = NDArray[np.float64]
+ELECTRON_KEV = 510.99895  # rest energy, CODATA 2018
 BUILD_UP_SCALE = 0.2  # mean free paths, in B = 1 + C t (1 + t / 0.2)^P exp(D t)
 T = TypeVar("T", Nuclide, Material)
 

@@ -2,5 +2,17 @@
 
 from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh, sample, sample_with_gradient
 from swarmsim.site.rays import path_lengths
+from swarmsim.site.store import ImportOptions, import_site, load_site
 
-__all__ = ["Obstacles", "Site", "SiteModel", "VisualMesh", "path_lengths", "sample", "sample_with_gradient"]
+__all__ = [
+    "ImportOptions",
+    "Obstacles",
+    "Site",
+    "SiteModel",
+    "VisualMesh",
+    "import_site",
+    "load_site",
+    "path_lengths",
+    "sample",
+    "sample_with_gradient",
+]

@@ -10,7 +10,8 @@ from swarmsim.site.raster import Floats, Grid, edges_on, faces_on, highest, in_p
 
 Mask = NDArray[np.bool_]
 
-FINE_CELLS_MAX = 4_000_000
+FINE_CELLS_MAX = 1_000_000
+POCKET_M2 = 50.0  # an enclosed place smaller than this counts as part of what encloses it
 FINE_FACTORS = (5, 3, 1)  # of the grid that distances are measured on; odd, so that centres stay centres
 
 
@@ -40,11 +41,18 @@ def clearance(
     for zone in zones:
         blocked |= in_polygon(fine.centres, np.array(zone.polygon_m))
     blocked |= np.repeat(np.repeat(outside, factor, 0), factor, 1)
+    blocked |= _pockets(blocked, POCKET_M2 / fine.cell**2)
     framed = np.pad(blocked, 1, constant_values=True)
     away, within = ndimage.distance_transform_edt(~framed), ndimage.distance_transform_edt(framed)
     # Distances run between centres; the boundary lies half a cell before the first blocked centre.
     signed = np.where(framed, 0.5 - within, away - 0.5) * fine.cell
     return signed[1 + factor // 2 : -1 : factor, 1 + factor // 2 : -1 : factor]
+
+
+def _pockets(blocked: Mask, cells: float) -> Mask:
+    """Free places smaller than ``cells`` that a rover cannot leave or reach, such as the inside of an open container."""
+    place, count = ndimage.label(~blocked)
+    return (np.bincount(place.ravel(), minlength=count + 1) < cells)[place] & ~blocked
 
 
 def _touched(fine: Grid, ground: Floats, corners: Floats, rules: Traversability) -> Mask:

@@ -15,7 +15,6 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-MESH_SUFFIXES = (".dae", ".glb", ".obj", ".stl")
 NO_COLOUR = (0, 0, 0, 0)  # of a part whose file gives none; the visual mesh chooses one
 
 # Rows: east, north and up in the axes of a file. COLLADA 1.4.1 (<up_axis>): right, in, up are -Y, +Z, +X for X_UP;

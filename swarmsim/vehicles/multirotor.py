@@ -4,6 +4,8 @@ Everything here is one vehicle in its body frame FLU (x forward, y left, z up, o
 All rotor axes point along body z.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -145,7 +147,8 @@ def ground_effect(height_m: jax.Array, radius_m: jax.Array) -> jax.Array:
     """Thrust over thrust far from the ground, at equal power, of rotors [...] ``height_m`` above it.
 
     Cheeseman and Bennett, "The effect of the ground on a helicopter rotor in forward flight" (ARC R&M 3021, 1955), in
-    hover: 1 / (1 - (R / 4 z)^2). The height is held above half a radius, where the theory ends: the factor is 4/3 at most.
+    hover: 1 / (1 - (R / 4 z)^2). The height is held above half a radius, where the theory ends: the factor is at most
+    4/3.
     """
     ratio = 0.25 * radius_m / jnp.maximum(height_m, GROUND_EFFECT_HEIGHT_MIN * radius_m)
     return 1.0 / (1.0 - ratio * ratio)
@@ -163,8 +166,9 @@ def wrench(
 ) -> tuple[jax.Array, jax.Array]:
     """Force [3] N and torque [3] N m (body) of rotors and air on the vehicle, mean over a step of ``dt`` s.
 
-    ``speed_before_rad_s`` and ``speed_after_rad_s`` [R] are the rotor speeds at the ends of the step, ``rotor_height_m``
-    [R] the hubs' heights above the ground, ``air_velocity_m_s`` [3] the vehicle's velocity through the air (body).
+    ``speed_before_rad_s`` and ``speed_after_rad_s`` [R] are the rotor speeds at the ends of the step,
+    ``rotor_height_m`` [R] the hubs' heights above the ground, ``air_velocity_m_s`` [3] the vehicle's velocity through
+    the air (body).
 
     Thrust k w^2 along body z; its torque c k w^2 and the reaction to the rotor's acceleration act against the spin; the
     rotors' angular momentum h along body z turns with the body and so gives the gyroscopic torque -omega x h
@@ -235,7 +239,7 @@ def _shapes(spec: Multirotor) -> list[str]:
         radius = spec.rotor.radius_m
         lines += [
             f'      <geom type="capsule" fromto="0 0 0 {x} {y} {z}" size="0.012" rgba="0.15 0.15 0.15 1" {look}/>',
-            f'      <geom type="cylinder" pos="{x} {y} {z + 0.03}" size="{radius} 0.003" rgba="0.2 0.2 0.2 0.4" {look}/>',
+            f'      <geom type="cylinder" pos="{x} {y} {z}" size="{radius} 0.003" rgba="0.2 0.2 0.2 0.4" {look}/>',
         ]
     for x, y, z in spec.feet.positions_m:
         lines.append(
@@ -249,5 +253,5 @@ def _spins(spec: Multirotor) -> np.ndarray:
     return np.array([1.0 if r.spin == "ccw" else -1.0 for r in spec.rotors])
 
 
-def _float32(numbers: dict) -> dict[str, jax.Array]:
+def _float32(numbers: dict[str, Any]) -> dict[str, jax.Array]:
     return {name: jnp.asarray(number, jnp.float32) for name, number in numbers.items()}

@@ -16,6 +16,14 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 
 Floats = NDArray[np.float64]
 
+# Contact of a tyre in MuJoCo's terms. MuJoCo's relaxed friction lifts what slides: at its default settings a rover that turns
+# on the spot hops and turns at half the rate that Coulomb's law gives. It does not while friction x SLIP_DAMPING x slip
+# stays below load / (inverse mass x IMPEDANCE / (1 - IMPEDANCE)), some 0.9 m/s here. The stiff friction rows (FRICTION_RATIO)
+# keep a parked rover from creeping down a slope in spite of the small damping: 2 mm/s on 15 degrees.
+IMPEDANCE = 0.5  # solimp, constant over the depth
+FRICTION_RATIO = 100.0  # impratio
+SLIP_DAMPING_1_S = 10.0  # b of solreffriction
+
 
 @dataclass(frozen=True)
 class RoverBody:
@@ -42,6 +50,8 @@ class SkidSteerParams:
     wheel_inertia_kg_m2: jax.Array  # [] one wheel about its axle
     rotor_inertia_kg_m2: jax.Array  # [] motor and gears of one wheel, as the wheel feels them
     friction: jax.Array  # [] Coulomb coefficient between tyre and ground
+    tyre_sinkage_m: jax.Array  # [] of a tyre under a quarter of the weight
+    tyre_creep_m_s: jax.Array  # [] slip at which friction has its full size (`analytic` engine)
     rolling_resistance: jax.Array  # [] resisting force over load
     torque_max_nm: jax.Array  # [] per wheel
     motor_time_constant_s: jax.Array  # [] lag of the torque
@@ -108,6 +118,8 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
         "wheel_inertia_kg_m2": body.wheel_inertia_kg_m2[0],
         "rotor_inertia_kg_m2": spec.motor.rotor_inertia_kg_m2,
         "friction": spec.wheels.friction,
+        "tyre_sinkage_m": 0.25 * body.mass_kg * GRAVITY_M_S2 / spec.wheels.stiffness_n_m,
+        "tyre_creep_m_s": tyre_creep(spec, body),
         "rolling_resistance": spec.wheels.rolling_resistance,
         "torque_max_nm": spec.motor.torque_max_nm,
         "motor_time_constant_s": spec.motor.time_constant_s,
@@ -130,6 +142,14 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
     return SkidSteerParams(**{name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
 
 
+def wheel_spacing(wheel_position_m: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Wheel base [] and track [] (m) of wheels at ``wheel_position_m`` [4, 3]."""
+    front_left, front_right, rear_left, rear_right = wheel_position_m
+    base = 0.5 * (front_left[0] + front_right[0] - rear_left[0] - rear_right[0])
+    track = 0.5 * (front_left[1] + rear_left[1] - front_right[1] - rear_right[1])
+    return base, track
+
+
 def effective_track(wheel_position_m: jax.Array) -> jax.Array:
     """Track [] (m) of the differential-drive robot that turns as the rover does while its tyres slip.
 
@@ -138,9 +158,44 @@ def effective_track(wheel_position_m: jax.Array) -> jax.Array:
     equally loaded Coulomb contacts: each slips sideways at w b / 2, so it must slip along the wheel at w b^2 / (2 B), and
     the tread's speed is w / 2 (B + b^2 / B) with the track B and the wheel base b, whatever the friction.
     """
-    base = 0.5 * (wheel_position_m[0, 0] + wheel_position_m[1, 0] - wheel_position_m[2, 0] - wheel_position_m[3, 0])
-    track = 0.5 * (wheel_position_m[0, 1] + wheel_position_m[2, 1] - wheel_position_m[1, 1] - wheel_position_m[3, 1])
+    base, track = wheel_spacing(wheel_position_m)
     return track + base * base / track
+
+
+def turning_force(params: SkidSteerParams, load_n: jax.Array) -> jax.Array:
+    """Force [] (N) along the wheels, all four together, that keeps a rover of total load ``load_n`` turning (see above)."""
+    base, track = wheel_spacing(params.wheel_position_m)
+    return params.friction * load_n * base * jax.lax.rsqrt(base * base + track * track)
+
+
+def wheel_inverse_mass(spec: SkidSteer, body: RoverBody) -> float:
+    """How much a wheel's centre accelerates per force (1/kg), mean over directions: MuJoCo's body_invweight0."""
+    axle = body.wheel_inertia_kg_m2[0]
+    mass = np.zeros((10, 10))
+    mass[:3, :3], mass[3:6, 3:6] = body.mass_kg * np.eye(3), body.inertia_kg_m2
+    mass[4, 6:] = mass[6:, 4] = axle
+    mass[6:, 6:] = (axle + spec.motor.rotor_inertia_kg_m2) * np.eye(4)
+    x, y, z = body.wheel_position_m[0]
+    jacobian = np.hstack([np.eye(3), [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]], np.zeros((3, 4))])
+    return float(np.trace(jacobian @ np.linalg.solve(mass, jacobian.T)) / 3.0)
+
+
+def tyre_constants(spec: SkidSteer, body: RoverBody) -> tuple[float, float]:
+    """Stiffness k (1/s^2) and damping b (1/s) of MuJoCo's reference acceleration -b v - k r for the tyre of ``spec``.
+
+    At depth r its force is D k d r with the impedance d and D = d / (1 - d) / inverse mass; D also moves with the rover
+    as added mass.
+    """
+    added = IMPEDANCE / (1.0 - IMPEDANCE) / wheel_inverse_mass(spec, body)
+    stiffness = spec.wheels.stiffness_n_m / (added * IMPEDANCE)
+    critical = 2.0 * math.sqrt(spec.wheels.stiffness_n_m * (0.25 * body.mass_kg + added))
+    return stiffness, spec.wheels.damping_ratio * critical / added
+
+
+def tyre_creep(spec: SkidSteer, body: RoverBody) -> float:
+    """Slip (m/s) at which the regularised friction of MuJoCo's contact under a quarter of the weight has its full size."""
+    friction_mass = FRICTION_RATIO * IMPEDANCE / (1.0 - IMPEDANCE) / wheel_inverse_mass(spec, body)
+    return 0.25 * body.mass_kg * GRAVITY_M_S2 * spec.wheels.friction / (friction_mass * SLIP_DAMPING_1_S)
 
 
 def skid_steer_mjcf(spec: SkidSteer, body: RoverBody | None = None, time_step_s: float = 0.005) -> str:
@@ -150,44 +205,59 @@ def skid_steer_mjcf(spec: SkidSteer, body: RoverBody | None = None, time_step_s:
     each, under the centre. Elliptic cones, so that friction has no preferred direction.
     """
     body = body or rover_body(spec)
-    axle, across = body.wheel_inertia_kg_m2
-    chassis_mass = body.mass_kg - 4.0 * body.wheel_mass_kg
-    chassis_centre = -body.wheel_mass_kg * body.wheel_position_m.sum(axis=0) / chassis_mass
-    inertia = body.inertia_kg_m2 - steiner(chassis_mass, chassis_centre)
-    for position in body.wheel_position_m:
-        inertia = inertia - np.diag([across, axle, across]) - steiner(body.wheel_mass_kg, position)
-    full = (inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2])
-    planes, wheels, motors = [], [], []
-    for bit, (name, position) in enumerate(zip(WHEELS, body.wheel_position_m, strict=True)):
-        pair = 1 << (bit + 1)
-        friction = f'friction="{spec.wheels.friction} 0 0"'
+    stiffness, damping = tyre_constants(spec, body)
+    mu = spec.wheels.friction
+    # MuJoCo divides a negative solref by the square of the impedance (stiffness) and by the impedance (damping).
+    reference = _text(-stiffness * IMPEDANCE**2, -damping * IMPEDANCE)
+    contact = (
+        f'condim="3" friction="{mu} {mu} 0 0 0" solref="{reference}" '
+        f'solreffriction="-1 {-SLIP_DAMPING_1_S * IMPEDANCE}" solimp="{IMPEDANCE} {IMPEDANCE} 0.001 0.5 1"'
+    )
+    geom = 'contype="0" conaffinity="0"'
+    planes, wheels, pairs, motors = [], [], [], []
+    for name, position in zip(WHEELS, body.wheel_position_m, strict=True):
         planes.append(
             f'<body name="ground_{name}" mocap="true" pos="0 0 {_text(position[2] - body.wheel_radius_m)}">'
-            f'<geom type="plane" size="1 1 1" contype="0" conaffinity="{pair}" {friction}/></body>'
+            f'<geom name="ground_{name}" type="plane" size="1 1 1" {geom}/></body>'
         )
+        axle, across = body.wheel_inertia_kg_m2
         wheels.append(
             f'<body name="{name}" pos="{_text(*position)}">'
             f'<joint name="{name}" type="hinge" axis="0 1 0" armature="{spec.motor.rotor_inertia_kg_m2}"/>'
             f'<inertial pos="0 0 0" mass="{body.wheel_mass_kg}" diaginertia="{_text(across, axle, across)}"/>'
-            f'<geom type="sphere" size="{body.wheel_radius_m}" contype="{pair}" conaffinity="0" {friction}/></body>'
+            f'<geom name="{name}" type="sphere" size="{body.wheel_radius_m}" {geom}/></body>'
         )
+        pairs.append(f'<pair geom1="ground_{name}" geom2="{name}" {contact}/>')
         motors.append(f'<motor name="{name}" joint="{name}"/>')
     return "\n".join(
         [
             f'<mujoco model="{spec.name}">',
-            f'<option timestep="{time_step_s}" gravity="0 0 -{GRAVITY_M_S2}" cone="elliptic" jacobian="dense">'
-            '<flag eulerdamp="disable"/></option>',
+            f'<option timestep="{time_step_s}" gravity="0 0 -{GRAVITY_M_S2}" cone="elliptic" impratio="{FRICTION_RATIO}"'
+            ' jacobian="dense"><flag eulerdamp="disable"/></option>',
             "<worldbody>",
             *planes,
             '<body name="chassis"><freejoint/>',
-            f'<inertial pos="{_text(*chassis_centre)}" mass="{chassis_mass}" fullinertia="{_text(*full)}"/>',
+            _chassis_inertial(body),
             *wheels,
             "</body>",
             "</worldbody>",
+            f"<contact>{''.join(pairs)}</contact>",
             f"<actuator>{''.join(motors)}</actuator>",
             "</mujoco>",
         ]
     )
+
+
+def _chassis_inertial(body: RoverBody) -> str:
+    """The ``inertial`` element of the chassis: the rover less its wheels."""
+    axle, across = body.wheel_inertia_kg_m2
+    mass = body.mass_kg - 4.0 * body.wheel_mass_kg
+    centre = -body.wheel_mass_kg * body.wheel_position_m.sum(axis=0) / mass
+    inertia = body.inertia_kg_m2 - steiner(mass, centre)
+    for position in body.wheel_position_m:
+        inertia = inertia - np.diag([across, axle, across]) - steiner(body.wheel_mass_kg, position)
+    full = (inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2])
+    return f'<inertial pos="{_text(*centre)}" mass="{mass}" fullinertia="{_text(*full)}"/>'
 
 
 def _text(*numbers: float) -> str:

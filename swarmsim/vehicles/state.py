@@ -24,11 +24,12 @@ class RigidState:
 
 @pytree
 class MultirotorState:
-    """A multirotor: body, rotor speeds, the give of what touches the ground, and energy used."""
+    """A multirotor: body, rotor speeds, contact with the ground, and energy used."""
 
     body: RigidState
     rotor_speed_rad_s: jax.Array  # [R] rad/s, magnitude (the sense of each rotor stands in the parameters)
     contact_slip_m: jax.Array  # [C, 3] m, body: elastic tangential give of each contact point, zero in the air
+    ground_force_n: jax.Array  # [] N, of the ground along its normal during the last step: the landing gear's switch
     energy_j: jax.Array  # [] J drawn from the battery since the start
 
 

@@ -1,0 +1,166 @@
+"""What ``swarmsim run`` and ``swarmsim view`` do."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from swarmsim.config.errors import InputError
+from swarmsim.config.names import one_of
+
+RECORDING, SUMMARY, SCENARIO = "mission.rrd", "summary.json", "scenario.yaml"
+
+_ROWS: tuple[tuple[str, str, str], ...] = (
+    ("Finding", "finding", ""),
+    ("Survey flight", "aerial.duration_s", "s"),
+    ("Survey path, all vehicles", "aerial.path_length_m", "m"),
+    ("Survey measurements", "aerial.measurements", ""),
+    ("Survey count rate, least", "aerial.count_rate_min_cps", "cps"),
+    ("Survey count rate, greatest", "aerial.count_rate_max_cps", "cps"),
+    ("Rover drive", "ground.duration_s", "s"),
+    ("Rover path", "ground.path_length_m", "m"),
+    ("Rover measurements", "ground.measurements", ""),
+    ("Rover count rate, least", "ground.count_rate_min_cps", "cps"),
+    ("Rover count rate, greatest", "ground.count_rate_max_cps", "cps"),
+    ("Hotspot", "hotspot.position_m", "m"),
+    ("Hotspot error", "hotspot.error_m", "m"),
+    ("Source", "source.position_m", "m"),
+    ("Source, standard deviation", "source.position_std_m", "m"),
+    ("Source error", "source.error_m", "m"),
+    ("Activity", "source.activity_mbq", "MBq"),
+    ("Activity error", "source.activity_error_percent", "%"),
+    ("Nuclide", "nuclide.name", ""),
+    ("Confidence", "nuclide.confidence", ""),
+    ("Real-time factor", "real_time_factor", ""),
+    ("Compilation", "timing.compile_s", "s"),
+    ("Rollout", "timing.run_s", "s"),
+    ("Writing", "timing.write_s", "s"),
+)
+
+
+def run_scenario(
+    name: str, out: Path | None, seed: int | None, missions: int, overrides: Sequence[str], force: bool
+) -> None:
+    """Fly ``missions`` missions of the scenario and print their summary; nothing is written when the input is wrong."""
+    from swarmsim.config.scenario import load_scenario
+
+    scenario = load_scenario(name, overrides, seed)
+    last_seed = scenario.mission.seed + missions - 1
+    if last_seed >= 2**31:
+        raise InputError.of(
+            "the seeds of the batch grow too large", given=f"the last is {last_seed}", allowed="less than 2147483648"
+        )
+    folder = out if out is not None else Path("runs") / scenario.mission.name
+    check_out(folder, force)
+
+    from swarmsim.missions.progress import RichProgress
+    from swarmsim.missions.run import run
+
+    with RichProgress(Console(stderr=True), missions) as progress:
+        # What check_out allowed may be replaced: an empty folder, or an earlier run with --force.
+        run(scenario, folder, missions, progress, force=force or folder.is_dir())
+    console = Console()
+    console.print(summary_table(read_summary(folder), scenario.mission.name, missions))
+    console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
+    if (folder / RECORDING).is_file():
+        console.print(f"Watch:   swarmsim view {folder}", highlight=False, soft_wrap=True)
+
+
+def check_out(folder: Path, force: bool) -> None:
+    """Raise `InputError` unless ``folder`` is new, or holds the results of an earlier run and ``force`` is given."""
+    if folder.is_file():
+        raise InputError.of("there is a file where the results should go", path="--out", given=str(folder))
+    if folder.is_dir() and any(folder.iterdir()):
+        if not force:
+            raise InputError.of(
+                "there are results already",
+                path="--out",
+                given=str(folder),
+                suggestion="choose another folder with --out, or replace them with --force",
+            )
+        if not (folder / SUMMARY).is_file() or not (folder / SCENARIO).is_file():
+            raise InputError.of(
+                f"the folder holds something else than a run, and is not replaced (no {SUMMARY} and {SCENARIO} in it)",
+                path="--out",
+                given=str(folder),
+                suggestion="choose another folder with --out",
+            )
+    parent = next(p for p in folder.absolute().parents if p.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError.of("the results cannot be written there", path="--out", given=str(folder))
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The content of a run's summary."""
+    summary: dict[str, Any] = json.loads((folder / SUMMARY).readvalue_text(encoding="utf-8"))
+    return summary
+
+
+def summary_table(summary: dict[str, Any], name: str, missions: int = 1) -> Table:
+    """What a summary holds, as a table: the known rows of one mission, or every number of a batch."""
+    title = name if missions == 1 else f"{name}, {missions} missions"
+    table = Table("what", "value", "unit", title=title, title_justify="left")
+    table.columns[1].justify = "right"
+    if missions > 1:
+        for path, number in _leaves(summary, ""):
+            table.add_row(path, value_text(number), "")
+        return table
+    for label, path, unit in _ROWS:
+        value: Any = summary
+        for step in path.split("."):
+            value = value.get(step) if isinstance(value, dict) else None
+        if value is not None:
+            table.add_row(label, value_text(value), unit)
+    for vehicle in summary.get("vehicles", ()):
+        state = "crashed" if vehicle["crashed"] else "intact"
+        table.add_row(f"Vehicle {vehicle['name']}", f"{state}, {value_text(vehicle['energy_wh'])}", "Wh")
+    return table
+
+
+def _leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _leaves(inner, f"{path}.{key}" if path else key)
+    elif not isinstance(value, list) or len(value) <= 4:
+        yield path, value
+
+
+def value_text(value: Any) -> str:
+    """A value as it stands in a table: four digits, thousands apart."""
+    if isinstance(value, list):
+        if not value:
+            return "none"
+        return "[" + ", ".join(map(value_text, value)) + "]"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
+
+
+def view_run(run: Path, web: bool) -> None:
+    """Open the recording of a run and wait until the viewer is closed."""
+    recording = run / RECORDING if run.is_dir() else run
+    if not run.exists():
+        runs = sorted(path.parent for path in Path("runs").glob(f"*/{RECORDING}"))
+        raise InputError.of(
+            "there is no such run",
+            given=str(run),
+            allowed=one_of(map(str, runs)) if runs else "the folder of a run; there is none in runs/ yet",
+        )
+    if not recording.is_file() or recording.suffix != ".rrd":
+        hint = "a batch of missions has no recording: run one of its seeds alone, with --seed"
+        raise InputError.of("holds no recording", file=str(run), allowed=f"a folder with {RECORDING}", suggestion=hint)
+    command = [sys.executable, "-m", "rerun", str(recording)]
+    if web:
+        command += ["--web-viewer", "--bind", "127.0.0.1"]
+    ended = subprocess.run(command, check=False)
+    if ended.returncode != 0:
+        raise InputError.of(
+            f"the Rerun viewer ended with exit code {ended.returncode}",
+            suggestion=None if web else "on a machine without a display, use --web",
+        )

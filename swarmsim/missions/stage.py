@@ -1,0 +1,42 @@
+"""Compiled functions that keep their compilation time apart from their running time."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+
+class Clock:
+    """Seconds spent compiling and running since it was last reset."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin again at zero."""
+        self.compile_s = 0.0
+        self.run_s = 0.0
+
+
+class Stage:
+    """A function compiled for each shape of its arguments that it meets; runs to completion at each call."""
+
+    def __init__(self, function: Callable[..., Any], clock: Clock):
+        self._jitted = jax.jit(function)
+        self._compiled: dict[Any, Any] = {}
+        self._clock = clock
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The function's value, its compilation (if any) and its run timed on the clock."""
+        leaves, structure = jax.tree.flatten(arguments)
+        key = structure, tuple(jax.typeof(leaf) for leaf in leaves)
+        compiled = self._compiled.get(key)
+        if compiled is None:
+            start = time.perf_counter()
+            compiled = self._compiled[key] = self._jitted.lower(*arguments).compile()
+            self._clock.compile_s += time.perf_counter() - start
+        start = time.perf_counter()
+        result = jax.block_until_ready(compiled(*arguments))
+        self._clock.run_s += time.perf_counter() - start
+        return result

@@ -1,0 +1,183 @@
+"""The figures of a mission for print: trajectories, aerial counts, the map, ground counts, the spectrum.
+
+They are the counterparts of Figures 6 to 9 of the reconnaissance paper, with the spectrum as the tenth.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from numpy.typing import NDArray
+
+from swarmsim.missions.record import Estimate, MissionRecord, RadiationMap
+from swarmsim.playback import plan
+from swarmsim.playback.colours import RATE_MAP, linear_scale, log_scale, smoothed_rate, vehicle_colours
+from swarmsim.playback.spectrum_figure import spectrum_figure
+from swarmsim.site.model import SiteModel
+
+_RATE_LABEL = "Count rate, 1 s mean [1/s]"
+_TRACK_POINTS_MAX = 4000
+
+
+def write(record: MissionRecord, site_model: SiteModel, folder: Path) -> list[Path]:
+    """Write the five figures as PNG and as PDF into ``folder`` (made if needed); returns the paths of the PNG files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    record = record.finite()
+    written = []
+    with plan.print_style():
+        for name, make in FIGURES.items():
+            figure = make(record, site_model)
+            path = folder / f"{name}.png"
+            figure.savefig(path, dpi=plan.DPI)
+            figure.savefig(path.with_suffix(".pdf"), dpi=plan.DPI)
+            written.append(path)
+    return written
+
+
+def trajectories(record: MissionRecord, site_model: SiteModel) -> Figure:
+    """Paths of all vehicles over the site plan."""
+    figure, axes = plan.new_plan(site_model, legend_height_in=0.62)
+    for vehicle, colour in zip(record.vehicles, vehicle_colours(record), strict=True):
+        x, y, _ = vehicle.position_m[:: max(1, len(vehicle.time_s) // _TRACK_POINTS_MAX)].T
+        line = "-" if vehicle.kind == "multirotor" else "--"
+        axes.plot(x, y, line, color=colour, label=vehicle.name, zorder=4)
+        axes.plot(x[:1], y[:1], "s", color=colour, markersize=3.0, markeredgecolor="black", markeredgewidth=0.4, zorder=6)
+    plan.draw_truth(axes, record)
+    handles, _ = axes.get_legend_handles_labels()
+    start = Line2D(
+        [], [], linestyle="none", marker="s", color="0.8", markeredgecolor="black", markersize=3.0, label="start"
+    )
+    plan.legend_above(axes, 3, [*handles, start, plan.building_patch()])
+    return figure
+
+
+def aerial_measurements(record: MissionRecord, site_model: SiteModel) -> Figure:
+    """Count rates measured from the air, where they were measured."""
+    figure, axes = plan.new_plan(site_model)
+    samples = record.samples.of_phase("aerial")
+    rate = smoothed_rate(samples)
+    scale = linear_scale(rate)
+    x, y, _ = samples.position_m.T
+    dots = axes.scatter(x, y, c=rate, s=2.2, cmap=RATE_MAP, norm=scale.norm, linewidths=0, zorder=4, rasterized=True)
+    plan.draw_truth(axes, record)
+    plan.colour_bar(figure, axes, dots, _RATE_LABEL)
+    handles, _ = axes.get_legend_handles_labels()
+    plan.legend_above(axes, 2, [*handles, plan.building_patch()])
+    return figure
+
+
+def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
+    """The interpolated map with contours, hotspots, truth and the estimate made from the air; whole and close up."""
+    made = record.map
+    centre, half = _close_up(record.aerial_estimate, made.hotspots_m, site_model)
+    figure, whole, close = plan.new_pair(site_model, centre, half)
+    for axes in (whole, close):
+        image = _draw_map(axes, made)
+        _outline_buildings(axes, site_model)
+        if len(made.hotspots_m):
+            axes.plot(*made.hotspots_m.T, linestyle="none", marker="o", markersize=9.0, markerfacecolor="none",
+                      markeredgecolor="black", markeredgewidth=1.0, label="hotspot", zorder=6)  # fmt: skip
+        plan.draw_truth(axes, record)
+        plan.draw_estimate(axes, record.aerial_estimate, "estimate from the air, 95 % ellipse")
+    plan.colour_bar(figure, close, image, "Count rate, interpolated [1/s]")
+    handles, _ = whole.get_legend_handles_labels()
+    plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="buildings, trees")])
+    return figure
+
+
+def _draw_map(axes: Axes, made: RadiationMap) -> AxesImage:
+    """The map as an image with white contours; the axes keep their limits."""
+    limits = axes.get_xlim(), axes.get_ylim()
+    ny, nx = made.mean_cps.shape
+    x, y = made.origin_m[0] + made.cell_m * np.arange(nx), made.origin_m[1] + made.cell_m * np.arange(ny)
+    half = 0.5 * made.cell_m
+    extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
+    low, high = float(made.mean_cps.min()), float(made.mean_cps.max())
+    norm = Normalize(low, max(high, low + 1.0))
+    image = axes.imshow(
+        made.mean_cps, norm=norm, extent=extent, origin="lower", cmap=RATE_MAP, interpolation="bilinear", zorder=2
+    )
+    if min(nx, ny) > 1 and high - low > 1e-3 * max(abs(high), 1.0):
+        lines = axes.contour(x, y, made.mean_cps, levels=6, colors="white", linewidths=0.5, zorder=3)
+        axes.clabel(lines, list(lines.levels)[1:4], fmt="%.0f", fontsize=7.0)
+    axes.set_xlim(limits[0])
+    axes.set_ylim(limits[1])
+    return image
+
+
+def _outline_buildings(axes: Axes, site_model: SiteModel) -> None:
+    site = site_model.site
+    above = np.asarray(site.surface_m, float) - np.asarray(site.terrain_m, float)
+    if above.max() <= plan.BUILDING_MIN_HEIGHT_M:
+        return
+    cell, origin = float(site.cell_m), np.asarray(site.origin_m, float)
+    x, y = origin[0] + cell * np.arange(above.shape[1]), origin[1] + cell * np.arange(above.shape[0])
+    outline = axes.contour(x, y, above, levels=[plan.BUILDING_MIN_HEIGHT_M], colors="black", linewidths=0.5, zorder=3)
+    outline.set_path_effects([withStroke(linewidth=1.3, foreground="white")])  # seen on the dark and on the bright end
+
+
+def ground_measurements(record: MissionRecord, site_model: SiteModel) -> Figure:
+    """Count rates measured along the rover's path, with a close-up of the place it searched."""
+    samples = record.samples.of_phase("ground")
+    centre, half = _close_up(record.estimate, samples.position_m[-1:, :2], site_model)
+    figure, whole, close = plan.new_pair(site_model, centre, half)
+    rate = smoothed_rate(samples)
+    norm = log_scale(rate).norm
+    x, y, _ = samples.position_m.T
+    for axes, size in ((whole, 5.0), (close, 14.0)):
+        if len(record.route_m) > 1:
+            axes.plot(*record.route_m[:, :2].T, "-", color="0.45", linewidth=0.7, label="planned route", zorder=3)
+        axes.scatter(x, y, c=rate, s=size, cmap=RATE_MAP, norm=norm, linewidths=0, zorder=5, rasterized=True)
+        plan.draw_truth(axes, record)
+        plan.draw_estimate(axes, record.estimate, "final estimate, 95 % ellipse")
+    if len(rate) == 0:
+        plan.note(close, "no measurements\non the ground")
+    bar = plan.colour_bar(figure, close, ScalarMappable(norm=norm, cmap=RATE_MAP), _RATE_LABEL)
+    _plain_log_ticks(bar, norm)
+    handles, _ = whole.get_legend_handles_labels()
+    plan.legend_above(whole, 2, [*handles, plan.building_patch()])
+    return figure
+
+
+def _plain_log_ticks(bar: Axes, norm: object) -> None:
+    """Ticks at 1, 2, 5 times powers of ten, written as plain numbers."""
+    assert isinstance(norm, LogNorm)
+    bar.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    bar.yaxis.set_major_formatter(ScalarFormatter())
+    bar.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _close_up(
+    estimate: Estimate | None, otherwise_m: NDArray[np.floating], site_model: SiteModel
+) -> tuple[NDArray[np.floating], float]:
+    """Centre [2] and half side (m) of a close-up: the estimate, else the first of ``otherwise_m`` [n, 2]."""
+    west, east, south, north = plan.site_extent(site_model)
+    half = min(10.0, 0.25 * (east - west), 0.25 * (north - south))
+    if estimate is not None:
+        half = max(half, 0.75 * plan.ellipse_95(estimate.covariance_m2)[0])
+        return np.asarray(estimate.position_m[:2], float), half
+    middle = np.array([0.5 * (west + east), 0.5 * (south + north)])
+    return (np.asarray(otherwise_m[0], float) if len(otherwise_m) else middle), half
+
+
+def spectrum(record: MissionRecord, site_model: SiteModel) -> Figure:
+    """The rover's spectrum with the fit, its lines and the residuals."""
+    del site_model
+    return spectrum_figure(record.spectrum)
+
+
+FIGURES = {
+    "fig6_trajectories": trajectories,
+    "fig7_aerial_measurements": aerial_measurements,
+    "fig8_radiation_map": radiation_map,
+    "fig9_ground_measurements": ground_measurements,
+    "fig10_spectrum": spectrum,
+}
+__all__ = ["FIGURES", "write"]

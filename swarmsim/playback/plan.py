@@ -1,0 +1,196 @@
+"""The site plan under every map figure: axes to scale, buildings in grey, north arrow, and print settings."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse, Patch
+from numpy.typing import NDArray
+
+from swarmsim.missions.record import Estimate, MissionRecord
+from swarmsim.playback.colours import ESTIMATE, TRUTH
+from swarmsim.site.model import SiteModel
+
+SINGLE_COLUMN_IN = 3.5  # 89 mm: one column of a two-column journal
+DOUBLE_COLUMN_IN = 7.16  # 182 mm: its full text width
+DPI = 300
+BUILDING_MIN_HEIGHT_M = 0.5  # lower things are kerbs and grass
+CHI2_95_2 = 5.991  # 95 % quantile of chi-squared, 2 degrees of freedom (NIST/SEMATECH e-Handbook, table 1.3.6.7.4)
+
+_STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 7.5,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "legend.fontsize": 7.0,
+    "axes.linewidth": 0.6,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "lines.linewidth": 0.9,
+    "legend.frameon": True,
+    "legend.framealpha": 0.9,
+    "legend.edgecolor": "0.8",
+    "legend.borderpad": 0.35,
+    "legend.handlelength": 1.6,
+    "pdf.fonttype": 42,  # text stays text
+}
+
+
+@contextmanager
+def print_style() -> Iterator[None]:
+    """Matplotlib's settings for print, inside the ``with`` alone."""
+    with matplotlib.rc_context(_STYLE):
+        yield
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure with a canvas of its own: nothing global, no window."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def site_extent(site_model: SiteModel) -> tuple[float, float, float, float]:
+    """West, east, south and north edge of the site in m."""
+    site = site_model.site
+    cell = float(site.cell_m)
+    ny, nx = site.terrain_m.shape
+    x, y = np.asarray(site.origin_m, float) - 0.5 * cell
+    return x, x + nx * cell, y, y + ny * cell
+
+
+def new_plan(site_model: SiteModel, legend_height_in: float = 0.45) -> tuple[Figure, Axes]:
+    """A single-column figure whose axes show the whole site to scale, with room for a legend above and a bar beside."""
+    west, east, south, north = site_extent(site_model)
+    left, right, bottom = 0.53, 0.66, 0.38
+    width = SINGLE_COLUMN_IN - left - right
+    height = min(width * (north - south) / (east - west), 1.6 * width)
+    total = bottom + height + legend_height_in
+    figure = new_figure(SINGLE_COLUMN_IN, total)
+    axes = figure.add_axes((left / SINGLE_COLUMN_IN, bottom / total, width / SINGLE_COLUMN_IN, height / total))
+    draw_site(axes, site_model)
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    return figure, axes
+
+
+def new_pair(site_model: SiteModel, centre_m: NDArray[np.floating], half_m: float) -> tuple[Figure, Axes, Axes]:
+    """A double-column figure: the whole site on the left, a square close-up around ``centre_m`` [2] on the right."""
+    figure = new_figure(DOUBLE_COLUMN_IN, 3.05)
+    whole = figure.add_axes((0.08, 0.13, 0.40, 0.73))
+    close = figure.add_axes((0.555, 0.13, 0.32, 0.73))
+    west, east, south, north = site_extent(site_model)
+    for axes in (whole, close):
+        draw_site(axes, site_model)
+    whole.set_xlim(west, east)
+    whole.set_ylim(south, north)
+    close.set_xlim(centre_m[0] - half_m, centre_m[0] + half_m)
+    close.set_ylim(centre_m[1] - half_m, centre_m[1] + half_m)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half_m + centre_m
+    whole.plot(*corners.T, color="black", linewidth=0.7, zorder=6)
+    whole.text(corners[3, 0], corners[3, 1] + 0.01 * (north - south), "close-up", fontsize=7.0, va="bottom", zorder=6)
+    return figure, whole, close
+
+
+def draw_site(axes: Axes, site_model: SiteModel) -> None:
+    """Buildings and other tall things in grey, the taller the darker; scale equal, north up."""
+    site = site_model.site
+    above = np.asarray(site.surface_m, float) - np.asarray(site.terrain_m, float)
+    shade = np.ma.masked_less(above, BUILDING_MIN_HEIGHT_M)
+    axes.imshow(
+        shade,
+        extent=site_extent(site_model),
+        origin="lower",
+        cmap="Greys",
+        vmin=-8.0,  # so that the lowest is already a clear grey
+        vmax=max(18.0, float(above.max()) * 1.4),
+        interpolation="nearest",
+        zorder=1,
+    )
+    axes.set_aspect("equal")
+    axes.set_xlabel("East [m]")
+    axes.set_ylabel("North [m]")
+    axes.annotate(
+        "N",
+        xy=(0.955, 0.965),
+        xytext=(0.955, 0.855),
+        xycoords="axes fraction",
+        ha="center",
+        va="center",
+        fontsize=7.5,
+        arrowprops={"arrowstyle": "-|>", "color": "black", "linewidth": 0.8, "shrinkA": 1, "shrinkB": 0},
+        zorder=9,
+    )
+
+
+def building_patch() -> Patch:
+    """Legend entry of the grey shapes."""
+    return Patch(facecolor="0.7", edgecolor="none", label="buildings, trees")
+
+
+def note(axes: Axes, text: str) -> None:
+    """A sentence in the middle of axes that have nothing to show."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=8.0, zorder=9)
+
+
+def colour_bar(figure: Figure, axes: Axes, mappable: object, label: str) -> Axes:
+    """A slim colour bar along the right of ``axes``, as high as they are."""
+    axes.apply_aspect()
+    box = axes.get_position()
+    bar_axes = figure.add_axes((box.x1 + 0.08 / figure.get_figwidth(), box.y0, 0.1 / figure.get_figwidth(), box.height))
+    bar = figure.colorbar(mappable, cax=bar_axes)  # type: ignore[arg-type]
+    bar.set_label(label)
+    bar.outline.set_linewidth(0.6)  # type: ignore[operator]
+    return bar_axes
+
+
+def legend_above(axes: Axes, columns: int, handles: list | None = None) -> None:
+    """A legend over the axes, out of the way of what is drawn."""
+    extra = {} if handles is None else {"handles": handles}
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(-0.02, 1.01), ncols=columns, borderaxespad=0.0, columnspacing=1.0, **extra
+    )
+
+
+def draw_truth(axes: Axes, record: MissionRecord) -> None:
+    """Crosses at the true sources."""
+    for k, source in enumerate(record.sources):
+        axes.plot(
+            *source.position_m[:2],
+            linestyle="none",
+            marker="x",
+            markersize=5.5,
+            markeredgewidth=1.4,
+            color=TRUTH,
+            label="true source" if k == 0 else None,
+            zorder=7,
+        )
+
+
+def draw_estimate(axes: Axes, estimate: Estimate | None, label: str) -> None:
+    """A dot at the estimate and the ellipse that holds 95 % of its horizontal uncertainty."""
+    if estimate is None:
+        return
+    centre = estimate.position_m[:2]
+    axes.plot(*centre, linestyle="none", marker="o", markersize=3.0, color=ESTIMATE, markeredgecolor="white",
+              markeredgewidth=0.4, label=label, zorder=8)  # fmt: skip
+    width, height, angle = ellipse_95(estimate.covariance_m2)
+    axes.add_patch(
+        Ellipse(
+            (centre[0], centre[1]), width, height, angle=angle, fill=False, edgecolor=ESTIMATE, linewidth=1.0, zorder=8
+        )
+    )
+
+
+def ellipse_95(covariance_m2: NDArray[np.floating]) -> tuple[float, float, float]:
+    """Full width and height (m) and turn (deg, counter-clockwise from east) of the horizontal 95 % ellipse."""
+    variances, axes = np.linalg.eigh(np.asarray(covariance_m2, float)[:2, :2])
+    width, height = 2.0 * np.sqrt(CHI2_95_2 * np.maximum(variances[::-1], 0.0))
+    return float(width), float(height), float(np.degrees(np.arctan2(axes[1, 1], axes[0, 1])))

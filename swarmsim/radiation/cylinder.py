@@ -1,0 +1,90 @@
+"""A cylindrical crystal seen from a point: its silhouette, its solid angle, and what crosses it.
+
+Directions are given by u = |cos| and s = sin of the angle between the crystal's axis and the line to the source.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+_RAYS = 96  # per axis of the grid over the silhouette
+
+
+def projected_area(radius_m: jax.Array, length_m: jax.Array, u: jax.Array, s: jax.Array) -> jax.Array:
+    """Silhouette [m2] of a cylinder: 2 a L s + pi a^2 u."""
+    return 2.0 * radius_m * length_m * s + jnp.pi * radius_m**2 * u
+
+
+def solid_angle_per_area(
+    radius_m: jax.Array, length_m: jax.Array, distance_m: jax.Array, u: jax.Array, s: jax.Array
+) -> jax.Array:
+    """Solid-angle fraction of the crystal over its silhouette [1/m2], at ``distance_m`` from the crystal's centre.
+
+    The silhouette A is a disc of radius sqrt(A / pi) at a distance h; the fraction (1 - h / S) / 2 with
+    S^2 = h^2 + A / pi is written A / (2 pi S (S + h)), which does not cancel in float32. h runs from 0 at the
+    crystal's surface (half of all photons) to the distance of the silhouette's mean depth: end-on that is the front
+    face (exact at any distance), side-on the plane of the axis, so that h^2 = d^2 - a^2. Inside the crystal h is 0.
+    """
+    area = projected_area(radius_m, length_m, u, s)
+    nearer = 0.5 * jnp.pi * radius_m**2 * length_m * u * u / area
+    surface = jnp.minimum(0.5 * length_m / jnp.maximum(u, 1e-9), radius_m / jnp.maximum(s, 1e-9))
+    squared = (distance_m - surface) * (distance_m + surface - 2.0 * nearer)
+    outside = (distance_m > surface) & (squared > 1e-12)
+    h = jnp.where(outside, jnp.sqrt(jnp.where(outside, squared, 1.0)), 0.0)
+    to_rim = jnp.sqrt(h * h + area / jnp.pi)
+    return 1.0 / (2.0 * jnp.pi * to_rim * (to_rim + h))
+
+
+def direction_basis(u: jax.Array, s: jax.Array) -> jax.Array:
+    """The five functions [5] of direction in which the effective area is written; see `fit_effective_area`."""
+    return jnp.stack([jnp.ones_like(u), u, s, u * s, u * u])
+
+
+def absorbing_area(radius_m: float, length_m: float, u: float, attenuation_1_m: Floats) -> Floats:
+    """Silhouette weighted with the chance to interact [m2], for parallel rays and each attenuation [k].
+
+    The integral of 1 - exp(-mu l) over the silhouette, l the chord of each ray; host side, by midpoint rays.
+    """
+    s = float(np.sqrt(max(1.0 - u * u, 0.0)))
+    half = radius_m * u + 0.5 * length_m * s
+    offsets = (np.arange(_RAYS) + 0.5) / _RAYS * 2.0 - 1.0
+    # sin substitution across the axis: midpoints stay accurate at the round edge
+    angle = offsets * 0.5 * np.pi
+    across = radius_m * np.sin(angle)
+    cell = (radius_m * np.cos(angle) * np.pi / _RAYS)[None, :] * (2.0 * half / _RAYS)
+    along = (offsets * half)[:, None]
+    half_chord = np.sqrt(np.maximum(radius_m**2 - across**2, 0.0))[None, :]
+    origin_x, origin_z = along * u, -along * s
+    enter, leave = np.full(half_chord.shape, -np.inf), np.full(half_chord.shape, np.inf)
+    if s > 0:
+        enter, leave = (-half_chord - origin_x) / s, (half_chord - origin_x) / s
+    else:
+        leave = np.where(np.abs(origin_x) <= half_chord, leave, -np.inf)
+    if u > 0:
+        enter = np.maximum(enter, (-0.5 * length_m - origin_z) / u)
+        leave = np.minimum(leave, (0.5 * length_m - origin_z) / u)
+    chord = np.maximum(leave - enter, 0.0)
+    return np.array([np.sum(cell * -np.expm1(-mu * chord)) for mu in attenuation_1_m])
+
+
+def fit_effective_area(radius_m: float, length_m: float, attenuation_1_m: Floats) -> Floats:
+    """Coefficients [k, 5] of `direction_basis` for the absorbing area of each attenuation [k]; host side.
+
+    A transparent crystal shows its volume (the constant), an opaque one its silhouette (u and s): the basis holds both
+    limits, and the fit between them is within 1 % of `absorbing_area` at any angle.
+    """
+    angles = np.linspace(0.0, 0.5 * np.pi, 13)
+    u, s = np.cos(angles), np.sin(angles)
+    u[-1] = 0.0
+    basis = np.stack([np.ones_like(u), u, s, u * s, u * u], axis=1)
+    weight = np.where((angles == angles[0]) | (angles == angles[-1]), 30.0, 1.0)
+    grid = np.geomspace(min(attenuation_1_m) * 0.99, max(attenuation_1_m) * 1.01, 40)
+    areas = np.stack([absorbing_area(radius_m, length_m, float(c), grid) for c in u])  # [angles, grid]
+    areas[0] = np.pi * radius_m**2 * -np.expm1(-grid * length_m)
+    scale = weight[:, None] / areas
+    systems = ((basis * w[:, None], a * w) for a, w in zip(areas.T, scale.T, strict=True))
+    coefficients = np.stack([np.linalg.lstsq(left, right, rcond=None)[0] for left, right in systems])
+    log_mu = np.log(attenuation_1_m)
+    return np.stack([np.interp(log_mu, np.log(grid), column) for column in coefficients.T], axis=-1)

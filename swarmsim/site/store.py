@@ -1,0 +1,231 @@
+"""Sites on disk: loading one by its name, the cache of what an import found, and importing a stranger's file."""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import platformdirs
+
+from swarmsim.config.documents import dump_yaml
+from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.files import available, find
+from swarmsim.config.load import load_model, load_named
+from swarmsim.config.names import did_you_mean, one_of
+from swarmsim.config.site import SiteSpec
+from swarmsim.site.files import MAX_FILE_MB, check_file
+from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
+
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What a user may say when importing a file: any field of `SiteSpec` but its file, and how to write."""
+
+    name: str | None = None  # of the site; the output folder's by default
+    licence: str = "not stated"
+    cell_m: float | None = None  # 0.5 m for a mesh, the file's own for an elevation model
+    fields: dict[str, Any] | None = None  # further fields of SiteSpec, e.g. {"unit_m": 0.01, "ground": ["Ground*"]}
+    overwrite: bool = False
+    preview: bool = True  # write preview.png
+
+
+def load_site(name_or_path: str | Path, material_names: Sequence[str]) -> SiteModel:
+    """The site of that name in ``configs/sites``, or of that folder or ``site.yaml``.
+
+    ``material_names`` is the order of the materials table, to which the obstacles' indices refer. The source file named
+    in the specification is imported, and the result kept in the user's cache folder under the hash of file,
+    specification and importer; a damaged entry is made anew. Raises `InputError` with what to do.
+    """
+    path = find("sites", name_or_path)
+    spec: SiteSpec = load_named("sites", path)
+    _check_materials(spec, material_names, path)
+    return _model(spec, _arrays(spec, path), material_names)
+
+
+def _check_materials(spec: SiteSpec, known: Sequence[str], path: Path) -> None:
+    used = {
+        "ground_material": spec.ground_material,
+        "default_material": spec.default_material,
+        **{f"obstacles.{i}.material": rule.material for i, rule in enumerate(spec.obstacles)},
+    }
+    problems = [
+        Problem(
+            "there is no such material", file=str(path), path=place, given=name, allowed=one_of(known),
+            suggestion=did_you_mean(name, known),
+        )
+        for place, name in used.items()
+        if name not in known
+    ]  # fmt: skip
+    if problems:
+        raise InputError(problems)
+
+
+def cache_folder() -> Path:
+    """Where imported sites are kept: ``$XDG_CACHE_HOME/swarmsim/sites`` or the platform's own."""
+    return Path(platformdirs.user_cache_dir("swarmsim", appauthor=False)) / "sites"
+
+
+def _arrays(spec: SiteSpec, site_file: Path) -> Arrays:
+    """What the import of a site finds, from the cache when it is there and sound."""
+    source = site_file.parent / spec.file
+    check_file(source, spec.max_file_mb)
+    entry = cache_folder() / f"{spec.name}-{_key(spec, source)}.npz"
+    with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        with entry.open("rb") as file, np.load(file) as arrays:
+            return _sound(dict(arrays))
+    from swarmsim.site.importer import build
+
+    fresh = _pack(build(source, spec))
+    with contextlib.suppress(OSError):  # a folder that cannot be written costs time, not the result
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as file:
+            np.savez(file, **fresh)
+        os.replace(file.name, entry)
+    return fresh
+
+
+def _key(spec: SiteSpec, source: Path) -> str:
+    """Hash of everything that the import depends on: file, orthophoto, specification and the importer's own code."""
+    digest = hashlib.sha256(spec.model_dump_json().encode())
+    files = [source] + ([source.parent / spec.orthophoto] if spec.orthophoto else [])
+    for file in [*files, *sorted(Path(__file__).parent.glob("*.py"))]:
+        digest.update(hashlib.sha256(file.read_bytes() if file.is_file() else b"").digest())
+    return digest.hexdigest()[:24]
+
+
+def _pack(raw: Any) -> Arrays:
+    """A `swarmsim.site.importer.RawSite` as named arrays of numbers and text."""
+    boxes = np.array([(*b.centre, *b.half, *b.axis, b.wall) for b in raw.boxes], np.float32).reshape(-1, 9)
+    return {
+        "grid": np.array([*raw.grid.origin, raw.grid.cell]),
+        "terrain": raw.terrain.astype(np.float32),
+        "surface": raw.surface.astype(np.float32),
+        "clearance": raw.clearance.astype(np.float32),
+        "cost": raw.cost.astype(np.float32),
+        "boxes": boxes,
+        "box_materials": np.array(raw.box_materials, dtype=np.str_),
+        "survey_area": raw.survey_area.astype(np.float32),
+        "vertices": raw.mesh.vertices_m,
+        "triangles": raw.mesh.triangles,
+        "colours": raw.mesh.colours,
+        "report": np.array(json.dumps(raw.report)),
+    }
+
+
+def _sound(arrays: Arrays) -> Arrays:
+    """The arrays of a cache entry; raises `KeyError` or `ValueError` when they cannot be a site's."""
+    shapes = {arrays[key].shape for key in ("terrain", "surface", "clearance", "cost")}
+    complete = {"grid", "boxes", "box_materials", "survey_area", "vertices", "triangles", "colours", "report"}
+    if len(shapes) != 1 or not complete <= arrays.keys() or not np.isfinite(arrays["terrain"]).all():
+        raise ValueError("damaged cache entry")
+    return arrays
+
+
+def _model(spec: SiteSpec, arrays: Arrays, material_names: Sequence[str]) -> SiteModel:
+    names = list(material_names)
+    boxes = arrays["boxes"]
+    material = np.array([names.index(str(m)) for m in arrays["box_materials"]], np.int32)
+    if len(boxes) == 0:
+        boxes = np.array([[0, 0, 0, 0, 0, 0, 1, 0, 0]], np.float32)
+        material = np.zeros(1, np.int32)
+    obstacles = Obstacles(
+        centre_m=jnp.asarray(boxes[:, :3]),
+        half_extent_m=jnp.asarray(boxes[:, 3:6]),
+        axis=jnp.asarray(boxes[:, 6:8]),
+        wall_m=jnp.asarray(boxes[:, 8]),
+        material=jnp.asarray(material),
+    )
+    site = Site(
+        origin_m=jnp.asarray(arrays["grid"][:2], jnp.float32),
+        cell_m=jnp.asarray(arrays["grid"][2], jnp.float32),
+        terrain_m=jnp.asarray(arrays["terrain"]),
+        surface_m=jnp.asarray(arrays["surface"]),
+        clearance_m=jnp.asarray(arrays["clearance"]),
+        cost=jnp.asarray(arrays["cost"]),
+        obstacles=obstacles,
+        survey_area_m=jnp.asarray(arrays["survey_area"]),
+        ground_material=jnp.asarray(names.index(spec.ground_material), jnp.int32),
+        material_names=tuple(names),
+    )
+    mesh = VisualMesh(arrays["vertices"], arrays["triangles"], arrays["colours"])
+    return SiteModel(name=spec.name, spec=spec, site=site, mesh=mesh, report=json.loads(str(arrays["report"])))
+
+
+def import_site(
+    file: str | Path,
+    out_dir: str | Path,
+    options: ImportOptions | None = None,
+    material_names: Sequence[str] | None = None,
+) -> SiteModel:
+    """Turn a mesh or an elevation model into a site: copy it to ``out_dir`` with a ``site.yaml`` and a preview.
+
+    ``material_names`` is the order of the materials table; the materials that the configuration knows by default.
+    The folder is complete or absent: it is written beside its place and renamed. Raises `InputError` when the file
+    cannot be a site or ``out_dir`` exists and ``options.overwrite`` is not set.
+    """
+    options = options or ImportOptions()
+    material_names = list(available("materials")) if material_names is None else material_names
+    source, out = Path(file), Path(out_dir)
+    check_file(source, float((options.fields or {}).get("max_file_mb", MAX_FILE_MB)))
+    if out.exists() and not options.overwrite:
+        raise InputError.of("there is something already", file=out, suggestion="choose another folder, or overwrite it")
+    if out.exists() and not (out / "site.yaml").is_file():
+        raise InputError.of("is not a site, so it will not be overwritten", file=out, suggestion="choose another folder")
+    data = _specification(source, out, options)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as work:
+        made = Path(work) / out.name
+        made.mkdir()
+        (made / "site.yaml").write_text(dump_yaml(data), encoding="utf-8")
+        spec: SiteSpec = load_model(made / "site.yaml", SiteSpec)
+        _check_materials(spec, material_names, made / "site.yaml")
+        shutil.copyfile(source, made / spec.file)
+        if spec.orthophoto is not None:
+            shutil.copyfile(source.parent / Path(spec.orthophoto).name, made / spec.orthophoto)
+        model = _model(spec, _arrays(spec, made / "site.yaml"), material_names)
+        if options.preview:
+            from swarmsim.site.preview import write_preview
+
+            write_preview(model, made / "preview.png")
+        if out.exists():
+            out.rename(Path(work) / "replaced")
+        made.rename(out)
+    return model
+
+
+def _specification(source: Path, out: Path, options: ImportOptions) -> dict[str, Any]:
+    """The content of ``site.yaml``."""
+    cell = options.cell_m
+    if cell is None:
+        cell = _own_cell(source) if source.suffix.lower() in (".tif", ".tiff") else 0.5
+    fields = dict(options.fields or {})
+    if "orthophoto" in fields:
+        picture = source.parent / fields["orthophoto"]
+        if not picture.is_file():
+            raise InputError.of("there is no such orthophoto", file=picture, path="orthophoto")
+        fields["orthophoto"] = picture.name
+    return {
+        "name": options.name or out.name,
+        "description": f"Imported from {source.name}",
+        "file": source.name,
+        "licence": options.licence,
+        "cell_m": cell,
+        **fields,
+    }
+
+
+def _own_cell(source: Path) -> float:
+    from swarmsim.site.elevation import own_cell
+
+    return own_cell(source)

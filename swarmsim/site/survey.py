@@ -1,0 +1,68 @@
+"""The area to survey: the polygon of the specification, or the site's own outline."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from swarmsim.config.errors import InputError
+from swarmsim.config.site import SiteSpec
+from swarmsim.site.raster import Floats, Grid
+
+VERTICES_MAX = 32
+
+
+def survey_area(grid: Grid, inside: NDArray[np.bool_], spec: SiteSpec) -> Floats:
+    """Convex polygon [v, 2], counter-clockwise: as given, or the hull of the cells ``inside``, a metre
+    or a cell within the outline."""
+    if spec.survey_area_m is not None:
+        return _given(grid, np.array(spec.survey_area_m))
+    inset = max(1.0, grid.cell)
+    depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * grid.cell
+    core = depth > inset if (depth > inset).any() else inside
+    rows = np.flatnonzero(core.any(axis=1))
+    left, right = core.argmax(axis=1)[rows], grid.nx - 1 - core[:, ::-1].argmax(axis=1)[rows]
+    ends = np.concatenate([np.column_stack([left, rows]), np.column_stack([right, rows])])
+    hull = _hull(ends * grid.cell + grid.origin)
+    while len(hull) > VERTICES_MAX:
+        before, after = np.roll(hull, 1, axis=0) - hull, np.roll(hull, -1, axis=0) - hull
+        lost = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0])
+        hull = np.delete(hull, int(np.argmin(lost)), axis=0)
+    return hull
+
+
+def _hull(points: Floats) -> Floats:
+    """Convex hull [v, 2] of ``points`` [n, 2], counter-clockwise (monotone chain, Andrew 1979)."""
+    ordered = [tuple(p) for p in np.unique(points, axis=0)]
+
+    def chain(run: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
+        kept: list[tuple[float, ...]] = []
+        for x, y in run:
+            while len(kept) > 1:
+                (ax, ay), (bx, by) = kept[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                    break
+                kept.pop()
+            kept.append((x, y))
+        return kept[:-1]
+
+    return np.array(chain(ordered) + chain(ordered[::-1]))
+
+
+def _given(grid: Grid, polygon: Floats) -> Floats:
+    edge = np.roll(polygon, -1, axis=0) - polygon
+    after = np.roll(edge, -1, axis=0)
+    turn = edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]
+    once_round = np.abs(np.sum(np.angle((after[:, 0] + 1j * after[:, 1]) / (edge[:, 0] + 1j * edge[:, 1])))) < 6.3
+    if not ((turn >= 0).all() or (turn <= 0).all()) or not turn.any() or not once_round:
+        raise InputError.of(
+            "the survey area is not a convex polygon", path="survey_area_m", given=str(polygon.tolist()),
+            suggestion="give its corners in order, without dents and crossings; divide a dented area into missions",
+        )  # fmt: skip
+    low = np.array(grid.origin) - 0.5 * grid.cell
+    high = low + grid.cell * np.array([grid.nx, grid.ny])
+    if ((polygon < low - 1e-6) | (polygon > high + 1e-6)).any():
+        raise InputError.of(
+            "the survey area reaches beyond the site", path="survey_area_m", given=str(polygon.tolist()),
+            allowed=f"x from {low[0]:g} to {high[0]:g} m, y from {low[1]:g} to {high[1]:g} m",
+        )  # fmt: skip
+    return polygon if turn.sum() > 0 else polygon[::-1]

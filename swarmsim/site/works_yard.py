@@ -1,0 +1,215 @@
+"""The shipped site ``works_yard``: a made-up industrial yard of 2.1 ha, drawn by this script.
+
+``python -m swarmsim.site.works_yard OUT.dae`` writes the mesh, the same bytes every time. What is here is made up for
+swarmsim; sizes are those of common things (a 20 ft container: ISO 668; a roll-off skip of about 30 m3).
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmsim.site.collada import Colour, write_collada
+from swarmsim.site.shapes import (
+    Floats,
+    Triangles,
+    box,
+    crown,
+    cylinder,
+    face_panels,
+    gables,
+    joined,
+    placed,
+    polygon_prism,
+    ribbon,
+    roof,
+    sheet,
+)
+
+HALF = (82.0, 64.0)  # m; the yard is a rectangle around the origin
+SKIP = (12.0, 4.0)  # middle of the open-top container
+
+COLOURS: dict[str, Colour] = {
+    "grass": (0.47, 0.53, 0.36), "meadow": (0.56, 0.59, 0.41), "gravel": (0.68, 0.65, 0.58),
+    "asphalt": (0.41, 0.42, 0.43), "paving": (0.60, 0.60, 0.58), "brick_red": (0.63, 0.42, 0.34),
+    "brick_ochre": (0.74, 0.61, 0.45), "concrete_light": (0.77, 0.76, 0.72), "concrete_grey": (0.64, 0.65, 0.65),
+    "roof_tiles": (0.52, 0.31, 0.25), "roof_slate": (0.36, 0.39, 0.43), "roof_felt": (0.45, 0.46, 0.47),
+    "window": (0.30, 0.38, 0.44), "door": (0.35, 0.27, 0.22), "skip_steel": (0.80, 0.55, 0.18),
+    "skip_floor": (0.42, 0.34, 0.26), "container_blue": (0.27, 0.41, 0.54), "container_rust": (0.61, 0.35, 0.25),
+    "container_green": (0.35, 0.47, 0.38), "tank_steel": (0.74, 0.76, 0.78), "fence_steel": (0.52, 0.55, 0.56),
+    "fence_wood": (0.55, 0.43, 0.31), "timber": (0.66, 0.52, 0.36), "bark": (0.38, 0.30, 0.23),
+    "foliage_dark": (0.28, 0.39, 0.24), "foliage_light": (0.40, 0.49, 0.27), "hedge": (0.31, 0.42, 0.26),
+}  # fmt: skip
+
+# name, centre, length, width, yaw deg, height of the eaves, of the ridge above them (0 = flat), walls, roof
+BUILDINGS: tuple[tuple[str, tuple[float, float], float, float, float, float, float, str, str], ...] = (
+    ("middle_building", (-4.0, 4.0), 18.0, 12.0, 0.0, 6.0, 3.6, "brick_red", "roof_tiles"),
+    ("office", (-18.0, 40.0), 26.0, 10.0, 0.0, 7.0, 0.0, "concrete_light", "roof_felt"),
+    ("workshop", (20.0, 36.0), 16.0, 12.0, 90.0, 4.8, 2.8, "brick_ochre", "roof_slate"),
+    ("warehouse", (-14.0, -42.0), 28.0, 16.0, 0.0, 9.8, 0.0, "concrete_grey", "roof_felt"),
+    ("shed", (24.0, -36.0), 11.0, 7.0, 8.0, 3.2, 1.8, "brick_ochre", "roof_slate"),
+    ("gatehouse", (-46.0, 6.0), 6.0, 4.5, 0.0, 3.2, 0.0, "concrete_light", "roof_felt"),
+    ("villa", (66.0, 42.0), 13.0, 9.0, 18.0, 5.2, 3.2, "brick_red", "roof_tiles"),
+    ("pump_house", (64.0, -28.0), 7.0, 5.0, -15.0, 3.6, 0.0, "concrete_grey", "roof_felt"),
+)
+# corners of the L-shaped laboratory on the plateau, counter-clockwise
+LABORATORY = ((58.0, 4.0), (76.0, 4.0), (76.0, 11.0), (65.0, 11.0), (65.0, 22.0), (58.0, 22.0))
+
+TREES = (
+    (-48, 44, 9.5), (-42, 51, 11.0), (-35, 55, 8.0), (-50, 56, 7.0), (-38, 27, 6.5), (-46, -38, 10.0), (-40, -52, 11.5),
+    (-50, -54, 8.0), (-37, -30, 6.0), (2, 24, 7.0), (6, 50, 9.0), (40, 56, 10.5), (50, 52, 8.5), (55, 58, 7.0),
+    (77, 56, 9.0), (77, 30, 7.5), (50, 30, 6.0), (74, -12, 8.0), (60, -46, 10.5), (68, -52, 9.0), (75, -42, 11.0),
+    (54, -56, 7.5), (8, -54, 8.5), (40, -56, 6.5),
+)  # fmt: skip
+# middle, length, yaw deg, height
+HEDGES = ((-18.0, 31.0, 22.0, 0.0, 1.5), (-46.0, 22.0, 14.0, 90.0, 1.8), (64.0, 32.0, 16.0, 18.0, 1.4))
+CONTAINERS = (
+    (-33.0, 14.0, 0.0, "container_blue"), (-33.0, 17.2, 0.0, "container_rust"), (36.0, -48.0, 30.0, "container_green"),
+    (43.0, -42.0, 34.0, "container_blue"), (34.0, 50.0, 90.0, "container_rust"), (14.0, -24.0, 0.0, "container_green"),
+)  # fmt: skip
+
+
+def _smooth(t: Floats) -> Floats:
+    t = np.clip(t, 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def ground_height(xy: Floats) -> Floats:
+    """Height [...] of the yard's ground at ``xy`` [..., 2]: a level yard, an eastern plateau with its ramp, swells."""
+    x, y = xy[..., 0], xy[..., 1]
+    plateau = 4.2 * _smooth((x - 27.0) / 32.0) * _smooth((y + 42.0) / 34.0)
+    bank = -1.1 * _smooth((-34.0 - y) / 22.0) * _smooth((-22.0 - x) / 18.0)
+    swell = 0.22 * np.sin(x / 13.0) * np.cos(y / 16.0 + 0.4) + 0.12 * np.sin((x + 2.0 * y) / 19.0)
+    return plateau + bank + swell
+
+
+def _ground() -> dict[tuple[str, str], Triangles]:
+    """The ground, cut by use."""
+    xs = np.unique(np.append(np.linspace(-HALF[0], HALF[0], 42), [-30.0, 30.0, -54.0, 27.0]))
+    ys = np.unique(np.append(np.linspace(-HALF[1], HALF[1], 33), [-14.0, -6.0, 28.0, -26.0]))
+    points = np.stack(np.meshgrid(xs, ys), axis=-1)
+    points = np.concatenate([points, ground_height(points)[..., None]], axis=-1)
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    middle = 0.25 * (a + b + c + d)
+    x, y = middle[..., 0], middle[..., 1]
+    road = (y > -14.0) & (y < -6.0)
+    yard = (x > -30.0) & (x < 30.0) & (y > -26.0) & (y < 28.0)
+    use = np.select([road, yard & (x > -12.0), yard, x < -54.0], ["asphalt", "paving", "gravel", "meadow"], "grass")
+    quads = np.stack([a, b, c, a, c, d], axis=-2).reshape(*use.shape, 2, 3, 3)
+    return {("ground", name): quads[use == name].reshape(-1, 3, 3) for name in sorted(set(use.ravel().tolist()))}
+
+
+def _level(centre: tuple[float, float], length: float, width: float, yaw: float) -> float:
+    """Lowest ground below a rectangle."""
+    corners = placed(np.array([[[i, j, 0.0] for i in (-0.5, 0, 0.5) for j in (-0.5, 0, 0.5)]]), length, width, 1.0)
+    turned = _at(corners, (*centre, 0.0), yaw)
+    return float(ground_height(turned[..., :2]).min())
+
+
+def _at(triangles: Triangles, place: tuple[float, float, float], yaw_deg: float) -> Triangles:
+    c, s = np.cos(np.radians(yaw_deg)), np.sin(np.radians(yaw_deg))
+    return triangles @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + np.array(place)
+
+
+def _buildings() -> dict[tuple[str, str], Triangles]:
+    parts: dict[tuple[str, str], Triangles] = {}
+    for name, centre, length, width, yaw, eaves, ridge, wall, cover in BUILDINGS:
+        place = (*centre, _level(centre, length, width, yaw))
+        parts[name, wall] = _at(placed(box(), length, width, eaves), place, yaw)
+        above = roof(length, width, eaves, ridge, 0.5) if ridge else sheet(length, width, eaves + 0.03)
+        parts[f"{name}_roof", cover] = _at(above, place, yaw)
+        if ridge:
+            parts[f"{name}_gables", wall] = _at(gables(length, width, eaves, ridge), place, yaw)
+        storeys = max(1, int(eaves // 3.2))
+        parts[f"{name}_windows", "window"] = _at(face_panels(length, width, storeys), place, yaw)
+        parts[f"{name}_door", "door"] = _at(placed(box(), 2.4, 0.06, 2.6) + [0.0, -0.5 * width, 0.0], place, yaw)
+    outline = np.array(LABORATORY)
+    base = float(ground_height(outline).min())
+    parts["laboratory", "concrete_light"] = polygon_prism(outline, base, base + 6.5)
+    parts["laboratory_roof", "roof_felt"] = polygon_prism(outline, base + 6.53, base + 6.53)
+    return parts
+
+
+def _skip() -> dict[tuple[str, str], Triangles]:
+    """A roll-off container without a lid: 6 x 2.4 x 2.2 m, walls of 4 mm, standing north to south."""
+    wall, long, wide, tall = 0.004, 6.0, 2.4, 2.2
+    sides = [
+        placed(box(), wide, wall, tall) + [0.0, 0.5 * (long - wall), 0.0],
+        placed(box(), wide, wall, tall) - [0.0, 0.5 * (long - wall), 0.0],
+        placed(box(), wall, long - 2 * wall, tall) + [0.5 * (wide - wall), 0.0, 0.0],
+        placed(box(), wall, long - 2 * wall, tall) - [0.5 * (wide - wall), 0.0, 0.0],
+    ]
+    place = (*SKIP, _level(SKIP, wide, long, 0.0) + 0.05)
+    floor = placed(box(), wide - 0.1, long - 0.1, wall) + [0.0, 0.0, 0.03]
+    return {
+        ("skip", "skip_steel"): _at(joined(sides), place, 0.0),
+        ("skip_floor", "skip_floor"): _at(floor, place, 0.0),
+    }
+
+
+def _yard_things() -> dict[tuple[str, str], Triangles]:
+    parts: dict[tuple[str, str], Triangles] = {}
+    for i, (x, y, yaw, colour) in enumerate(CONTAINERS):
+        place = (x, y, _level((x, y), 6.06, 2.44, yaw))
+        parts[f"container_{i + 1}", colour] = _at(placed(box(), 6.06, 2.44, 2.59), place, yaw)
+    tank = (-36.0, -20.0, float(ground_height(np.array([-36.0, -20.0]))))
+    parts["tank", "tank_steel"] = _at(cylinder(1.6, 4.2, 16), tank, 0.0)
+    stacks = [(30.5, 18.0), (30.5, 21.0), (34.5, 19.5)]
+    timber = [_at(placed(box(), 3.2, 1.1, 1.3), (x, y, _level((x, y), 3.2, 1.1, 0.0)), 0.0) for x, y in stacks]
+    parts["timber_stacks", "timber"] = joined(timber)
+    blocks = [(x, 17.5) for x in (-8.0, -5.0, -2.0, 1.0)]
+    barrier = [_at(placed(box(), 2.2, 0.5, 0.9), (x, y, _level((x, y), 2.2, 0.5, 0.0)), 0.0) for x, y in blocks]
+    parts["barriers", "concrete_grey"] = joined(barrier)
+    return parts
+
+
+def _fences() -> dict[tuple[str, str], Triangles]:
+    def along(*corners: tuple[float, float]) -> NDArray[np.float64]:
+        runs = [
+            np.linspace(a, b, max(2, int(np.hypot(b[0] - a[0], b[1] - a[1]) / 6.0)))
+            for a, b in zip(corners[:-1], corners[1:], strict=True)
+        ]
+        line = np.concatenate([run[:-1] for run in runs] + [runs[-1][-1:]])
+        return np.column_stack([line, ground_height(line)])
+
+    return {
+        ("south_wall", "brick_ochre"): ribbon(along((-44.0, -61.0), (34.0, -61.0)), 2.1, 0.25),
+        ("north_wall", "concrete_grey"): ribbon(along((-30.0, 60.0), (28.0, 60.0)), 2.0, 0.2),
+        ("east_fence", "fence_steel"): ribbon(along((79.5, -60.0), (79.5, 61.0)), 1.8, 0.0),
+        ("south_fence", "fence_steel"): ribbon(along((36.0, -61.0), (79.0, -61.0)), 1.8, 0.0),
+        ("garden_fence", "fence_wood"): ribbon(along((53.0, 36.0), (57.0, 53.0), (72.0, 58.0)), 1.2, 0.04),
+    }
+
+
+def _plants() -> dict[tuple[str, str], Triangles]:
+    trunks, dark, light = [], [], []
+    for i, (x, y, height) in enumerate(TREES):
+        foot = (float(x), float(y), float(ground_height(np.array([x, y], np.float64))) - 0.1)
+        trunks.append(_at(cylinder(0.035 * height, 0.45 * height, 6), foot, 0.0))
+        leaves = crown(0.26 * height, 0.36 * height) + [0.0, 0.0, 0.64 * height]
+        (dark if i % 2 else light).append(_at(leaves, foot, 37.0 * i))
+    hedges = [_at(placed(box(), n, 1.1, h), (x, y, _level((x, y), n, 1.1, a)), a) for x, y, n, a, h in HEDGES]
+    return {
+        ("tree_trunks", "bark"): joined(trunks),
+        ("tree_crowns_dark", "foliage_dark"): joined(dark),
+        ("tree_crowns_light", "foliage_light"): joined(light),
+        ("hedges", "hedge"): joined(hedges),
+    }
+
+
+def parts() -> dict[tuple[str, str], Triangles]:
+    """Triangles [t, 3, 3] (ENU, m) of the yard by (geometry, material)."""
+    groups = (_ground(), _buildings(), _skip(), _yard_things(), _fences(), _plants())
+    return {key: triangles for group in groups for key, triangles in group.items()}
+
+
+def write(path: Path) -> None:
+    """Write the yard as COLLADA."""
+    write_collada(path, parts(), COLOURS)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        raise SystemExit("usage: python -m swarmsim.site.works_yard OUT.dae")
+    write(Path(sys.argv[1]))

@@ -1,0 +1,185 @@
+"""Finding, composing and overriding configurations."""
+
+from pathlib import Path
+
+import pytest
+
+from swarmsim.config import files
+from swarmsim.config.documents import Mark
+from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.load import load_all, load_model, load_named, read_document
+from swarmsim.config.mission import Mission
+from swarmsim.config.names import did_you_mean, nearest
+from swarmsim.config.scenario import load_scenario, scenario_of
+from swarmsim.config.vehicles import Multirotor, Vehicle
+from tests.config.project import line_of, spoil
+
+
+def test_a_problem_reads_as_a_block() -> None:
+    problem = Problem("is too small", "a.yaml", 3, "x.y", "-1", "a number at least 0", "try 1")
+    assert str(problem) == (
+        "a.yaml:3 x.y: is too small\n    given:   -1\n    allowed: a number at least 0\n    hint:    try 1"
+    )
+    assert str(Problem("alone")) == "alone"
+    error = InputError.of("gone", file=Path("b.yaml"))
+    assert error.problems == (Problem("gone", "b.yaml"),)
+    with pytest.raises(ValueError, match="at least one"):
+        InputError([])
+
+
+def test_nearest_names() -> None:
+    assert nearest("co60", ["Cs-137", "Co-60", "Co-57"]) == "Co-60"
+    assert did_you_mean("zebra", ["Cs-137", "Co-60"]) is None
+
+
+def test_the_working_folder_comes_before_the_package(mission: Path) -> None:
+    assert files.available("missions")["recon"].resolve() == mission
+    assert files.config_dirs()[-1] == files.packaged_dir()
+
+
+def test_the_working_folder_overrides_a_vehicle_of_a_packaged_mission(
+    mission: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packaged = mission.parents[1].rename(tmp_path / "_configs")
+    monkeypatch.setattr(files, "packaged_dir", lambda: packaged)
+    own = tmp_path / "configs" / "vehicles" / "orpheus.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_text((packaged / "vehicles" / "orpheus.yaml").read_text())
+    assert load_scenario("recon").vehicles[3].mass_kg == 51.0
+    spoil(own, "mass_kg: 51.0", "mass_kg: 61.0")
+    assert load_scenario("recon").vehicles[3].mass_kg == 61.0
+
+
+def test_names_beside_a_mission_file_are_found_from_anywhere(
+    mission: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vehicles = mission.parents[1] / "vehicles"
+    (vehicles / "mine.yaml").write_text((vehicles / "tarot_t650.yaml").read_text())
+    spoil(vehicles / "mine.yaml", "name: tarot_t650", "name: mine")
+    spoil(mission, "type: tarot_t650", "type: mine")
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    assert load_scenario(mission).vehicles[0].name == "mine"
+
+
+def test_a_mission_extends_another_deeply(mission: Path) -> None:
+    child = mission.with_name("child.yaml")
+    child.write_text("extends: recon_paper\nname: child\naerial: {altitude_m: 30.0}\nsources: []\n")
+    parent, loaded = load_model(mission, Mission), load_model(child, Mission)
+    assert loaded.detection == "paper_ideal"
+    assert loaded.aerial == parent.aerial.model_copy(update={"altitude_m": 30.0})
+    assert loaded.sources == ()
+    assert loaded.vehicles == parent.vehicles
+
+
+def test_a_value_keeps_the_file_and_line_where_it_stands(mission: Path) -> None:
+    child = mission.with_name("child.yaml")
+    child.write_text("extends: recon.yaml\nname: child\n\nwind: {speed_m_s: 99}\n")
+    spoil(mission, "altitude_m: 20.0", "altitude_m: -1")
+    with pytest.raises(InputError) as caught:
+        load_model(child, Mission)
+    assert {(p.path, p.file, p.line) for p in caught.value.problems} == {
+        ("wind.speed_m_s", "configs/missions/child.yaml", 4),
+        ("aerial.altitude_m", "configs/missions/recon.yaml", line_of(mission, "altitude_m")),
+    }
+
+
+def test_a_longer_cycle_of_extends_is_told(mission: Path) -> None:
+    for name, other in (("a", "b"), ("b", "c"), ("c", "a")):
+        mission.with_name(f"{name}.yaml").write_text(f"extends: {other}\nname: {name}\n")
+    with pytest.raises(InputError, match="extends itself: a -> b -> c -> a"):
+        load_scenario("a")
+
+
+def test_a_vehicle_extends_another(mission: Path) -> None:
+    path = mission.parents[1] / "vehicles" / "heavy.yaml"
+    path.write_text("extends: tarot_t650\nname: heavy\nmass_kg: 4.5\n")
+    base, heavy = load_named("vehicles", "tarot_t650"), load_named("vehicles", "heavy")
+    assert heavy == base.model_copy(update={"name": "heavy", "mass_kg": 4.5})
+    assert isinstance(load_model(path, Vehicle), Multirotor)
+
+
+def test_overrides_change_values_by_field_index_and_name(mission: Path) -> None:
+    changed = load_scenario(
+        "recon",
+        [
+            "aerial.altitude_m=30",
+            "sources.0.activity_mbq=5e1",
+            "vehicles.uav2.heading_deg=90",
+            "aerial.line_spacing_m=12",
+            "aerial.area_m=[[-50, -40], [50, -40], [50, 40]]",
+            "wind.gusts=false",
+        ],
+        seed=7,
+    ).mission
+    assert changed.aerial.altitude_m == 30
+    assert changed.aerial.line_spacing_m == 12
+    assert changed.aerial.area_m == ((-50, -40), (50, -40), (50, 40))
+    assert changed.sources[0].activity_mbq == 50
+    assert [member.heading_deg for member in changed.vehicles] == [0, 90, 0, 0]
+    assert not changed.wind.gusts
+    assert changed.seed == 7
+
+
+def test_an_override_is_told_as_such(mission: Path) -> None:
+    document = read_document(mission, "missions", ["sources.0={nuclide: Cs-137}"])
+    assert document.mark(("sources", 0, "nuclide")) == Mark("--set", None)
+    assert document.mark(("sources",)) == Mark("configs/missions/recon.yaml", line_of(mission, "sources:"))
+
+
+def test_an_override_reaches_into_a_vehicle(mission: Path) -> None:
+    scenario = load_scenario("recon", ["definitions.vehicles.tarot_t650.mass_kg=4.0"])
+    assert scenario.vehicles[0].mass_kg == 4.0
+    assert scenario.vehicles[0] == load_named("vehicles", "tarot_t650").model_copy(update={"mass_kg": 4.0})
+    assert scenario.vehicles[3] == load_named("vehicles", "orpheus")
+
+
+def test_the_area_is_turned_counter_clockwise(mission: Path) -> None:
+    scenario = load_scenario("recon", ["aerial.area_m=[[0, 0], [0, 9], [9, 9], [9, 0]]"])
+    assert scenario.mission.aerial.area_m == ((9, 0), (9, 9), (0, 9), (0, 0))
+
+
+def test_zero_activity_and_no_sources_are_missions(mission: Path) -> None:
+    assert load_scenario("recon", ["sources.0.activity_mbq=0"]).mission.sources[0].activity_mbq == 0
+    assert load_scenario("recon", ["sources=[]"]).mission.sources == ()
+
+
+def test_a_body_file_is_found_beside_its_vehicle(mission: Path) -> None:
+    vehicles = mission.parents[1] / "vehicles"
+    (vehicles / "body.urdf").write_text("<robot name='r'/>")
+    orpheus = vehicles / "orpheus.yaml"
+    orpheus.write_text(orpheus.read_text() + "\nbody: {file: body.urdf}\n")
+    assert Path(load_named("vehicles", "orpheus").body.file) == vehicles / "body.urdf"
+
+
+def test_a_scenario_written_out_is_the_same_scenario(mission: Path) -> None:
+    scenario = load_scenario("recon_paper", ["definitions.vehicles.tarot_t650.mass_kg=4.0"], seed=3)
+    written = mission.parents[2] / "runs" / "one" / "scenario.yaml"
+    written.parent.mkdir(parents=True)
+    written.write_text(scenario.to_yaml(), encoding="utf-8")
+    spoil(mission.parents[1] / "vehicles" / "orpheus.yaml", "mass_kg: 51.0", "mass_kg: 61.0")
+    (mission.parents[1] / "nuclides" / "Zz-1.yaml").write_text("not: valid\n")
+    again = load_scenario(written)
+    assert again.vehicles == scenario.vehicles
+    assert again.detectors == scenario.detectors
+    assert again.nuclides == scenario.nuclides
+    assert again.materials == scenario.materials
+    dropped = {"definitions", "versions"}
+    assert again.mission.model_dump(exclude=dropped) == scenario.mission.model_dump(exclude=dropped)
+    assert again.mission.versions == scenario.versions()
+    assert again.to_yaml() == scenario.to_yaml()
+
+
+def test_a_mission_made_in_python_is_checked_too(mission: Path) -> None:
+    made = load_model(mission, Mission)
+    assert scenario_of(made).vehicles == load_scenario("recon").vehicles
+    with pytest.raises(InputError, match="no site 'nowhere'"):
+        scenario_of(made.model_copy(update={"site": "nowhere"}))
+
+
+def test_every_broken_file_of_a_kind_is_told(mission: Path) -> None:
+    nuclides = mission.parents[1] / "nuclides"
+    for name in ("Co-60", "Cs-137"):
+        spoil(nuclides / f"{name}.yaml", "half_life_s", "halflife_s")
+    with pytest.raises(InputError) as caught:
+        load_all("nuclides")
+    assert {Path(p.file).stem for p in caught.value.problems if p.file} == {"Co-60", "Cs-137"}

@@ -1,0 +1,266 @@
+"""Motion of a multirotor in the air, in both engines, against closed forms and MuJoCo C."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from swarmsim.config.errors import InputError
+from swarmsim.control.multirotor import Setpoint
+from swarmsim.physics.multirotor import longest_time_step, make_multirotor_step, step_loads
+from swarmsim.vehicles.multirotor import multirotor_mjcf
+from tests.flights import (
+    CALM,
+    DT,
+    ENGINES,
+    GRAVITY,
+    airborne,
+    angle_deg,
+    attitude,
+    fly,
+    fly_controlled,
+    hover_speed,
+    params_of,
+    plane,
+    spec_of,
+)
+
+N = 400
+STEPS = 50
+TIME = DT * np.arange(1, N + 1)
+engines = pytest.mark.parametrize("engine", ENGINES)
+
+
+@engines
+@pytest.mark.parametrize(("name", "speed"), [("tarot_t650", 3420.07 * 2 * np.pi / 60), ("x500", None)])
+def test_hovers_at_its_hover_speed(engine, name, speed):
+    params = params_of(name)
+    speed = speed or hover_speed(params)
+    states = fly(params, airborne(params, speed=speed), speed, steps=N, name=name, engine=engine)
+    np.testing.assert_allclose(states.body.position_m[-1], [0, 0, 100.0], atol=2e-3)
+    assert angle_deg(states.body.quaternion[-1], [1.0, 0, 0, 0]) < 1e-3
+
+
+@engines
+def test_falls_freely_without_motors_or_air(engine):
+    params = replace(params_of(), drag_quadratic_kg_m=jnp.float32(0.0))
+    states = fly(params, airborne(params), 0.0, steps=N, engine=engine)
+    k = np.arange(1, N + 1)
+    np.testing.assert_allclose(states.body.velocity_m_s[:, 2], -GRAVITY * TIME, rtol=1e-4)
+    # Semi-implicit Euler sums the new velocities: n (n + 1) / 2 steps.
+    np.testing.assert_allclose(states.body.position_m[:, 2], 100 - GRAVITY * DT**2 * k * (k + 1) / 2, atol=2e-3)
+
+
+@engines
+def test_reaches_its_terminal_velocity(engine):
+    params = params_of()
+    states = fly(params, airborne(params, height=400.0), 0.0, steps=4 * N, engine=engine)
+    terminal = np.sqrt(3.5 * GRAVITY / 0.0995494)
+    time = DT * np.arange(1, 4 * N + 1)
+    expected = -terminal * np.tanh(GRAVITY * time / terminal)
+    np.testing.assert_allclose(states.body.velocity_m_s[:, 2], expected, atol=0.03)
+    assert states.body.velocity_m_s[-1, 2] == pytest.approx(-terminal, rel=2e-3)
+
+
+def test_wind_carries_a_still_body():
+    params = params_of()
+    speed = hover_speed(params)
+    states = fly(params, airborne(params, speed=speed), speed, steps=N, wind=jnp.array([6.0, 0.0, 0.0]))
+    # dv/dt = c (W - v)^2 / m from rest: W - v = W / (1 + c W t / m).
+    left = 6.0 / (1 + 0.0995494 * 6.0 * TIME / 3.5)
+    np.testing.assert_allclose(6.0 - states.body.velocity_m_s[:, 0], left, rtol=2e-3)
+
+
+@engines
+def test_thrust_step_follows_the_rotor_lag(engine):
+    params = replace(params_of(), drag_quadratic_kg_m=jnp.float32(0.0))
+    hover = hover_speed(params)
+    target = 1.2 * hover
+    states = fly(params, airborne(params, speed=hover), target, steps=N, engine=engine)
+    tau = 0.03
+    speed = target + (hover - target) * np.exp(-TIME / tau)
+    np.testing.assert_allclose(states.rotor_speed_rad_s, np.repeat(speed[:, None], 4, 1), rtol=1e-5)
+    # Velocity of the closed form: integral of g ((w / hover)^2 - 1).
+    gap = (hover - target) / hover
+    squares = (
+        1.44 * TIME + 2 * 1.2 * gap * tau * (1 - np.exp(-TIME / tau)) + gap**2 * tau / 2 * (1 - np.exp(-2 * TIME / tau))
+    )
+    np.testing.assert_allclose(states.body.velocity_m_s[:, 2], GRAVITY * (squares - TIME), atol=3e-3)
+
+
+@engines
+def test_yaw_follows_the_torques_and_the_rotors_momentum(engine):
+    params = params_of()
+    hover = hover_speed(params)
+    spins = np.asarray(params.rotor_spin)
+    command = hover * np.sqrt(1 - 0.1 * spins)  # clockwise rotors faster: the body turns counter-clockwise
+    states = fly(params, airborne(params, speed=hover), command, steps=N, engine=engine)
+    fine = np.linspace(0, TIME[-1], 40001)
+    speeds = command + (hover - command) * np.exp(-fine[:, None] / 0.03)
+    torque = -(spins * 0.0399 * 6.69191e-5 * speeds**2).sum(1)
+    impulse = np.concatenate([[0.0], np.cumsum(0.5 * (torque[1:] + torque[:-1]) * np.diff(fine))])
+    momentum = 2.0e-4 * (spins * (speeds - hover)).sum(1)
+    expected = np.interp(TIME, fine, (impulse - momentum) / 0.18484375)
+    found = states.body.angular_velocity_rad_s
+    np.testing.assert_allclose(found[:, 2], expected, rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(found[:, :2], 0.0, atol=1e-4)
+    assert found[-1, 2] > 1.0
+
+
+@engines
+@pytest.mark.parametrize("rotors", [0.0, 200.0])
+def test_tumbling_keeps_momentum_and_energy(engine, rotors):
+    """Torque-free tumbling, also with flywheels: two rotors that turn the same way and touch no air."""
+    params = replace(
+        params_of(),
+        inertia_kg_m2=jnp.array([0.10, 0.14, 0.18]),
+        thrust_coefficient_n_s2=jnp.float32(0.0),
+        drag_quadratic_kg_m=jnp.float32(0.0),
+        rotor_inertia_kg_m2=jnp.float32(1e-3),
+        speed_min_rad_s=jnp.float32(0.0),
+        time_constant_down_s=jnp.float32(1e9),
+    )
+    speeds = rotors * jnp.array([1.0, 1.0, 0.0, 0.0])
+    start = airborne(params, speed=speeds, rate=(1.5, 0.4, -1.0))
+    states = fly(params, start, jnp.maximum(speeds, 1e-6), steps=N, engine=engine)
+    rate = states.body.angular_velocity_rad_s.astype(np.float64)
+    flywheel = 1e-3 * (np.asarray(params.rotor_spin) * states.rotor_speed_rad_s).sum(1)
+    momentum_body = rate * [0.10, 0.14, 0.18] + flywheel[:, None] * [0, 0, 1.0]
+    momentum = np.einsum("nij,nj->ni", attitude(states.body.quaternion), momentum_body)
+    drift = np.linalg.norm(momentum - momentum[0], axis=1) / np.linalg.norm(momentum[0])
+    energy = 0.5 * (rate**2 * [0.10, 0.14, 0.18]).sum(1)
+    assert drift.max() < 0.02
+    assert np.abs(energy / energy[0] - 1).max() < 0.02
+    assert angle_deg(states.body.quaternion[-1], [1.0, 0, 0, 0]) > 5.0  # it did tumble
+
+
+def _turning_flight(time):
+    """Figure of eight with a climb and a yaw: every axis moves."""
+    a, w = 4.0, 0.8
+    zero = 0.0 * time
+    return Setpoint(
+        position_m=jnp.stack([a * jnp.sin(w * time), a * jnp.sin(2 * w * time) / 2, 50.0 + jnp.sin(w * time)]),
+        velocity_m_s=w * jnp.stack([a * jnp.cos(w * time), a * jnp.cos(2 * w * time), jnp.cos(w * time)]),
+        acceleration_m_s2=jnp.stack([zero, zero, zero]),
+        yaw_rad=jnp.sin(0.5 * time),
+    )
+
+
+@pytest.mark.parametrize("name", ["tarot_t650", "x500"])
+def test_engines_agree_on_ten_seconds_of_free_flight(name):
+    params = params_of(name)
+    start = airborne(params, height=50.0, speed=hover_speed(params))
+    flown, _, commands = fly_controlled(params, _turning_flight, 10.0, state=start, wind=3.0, name=name)
+    commands = np.repeat(commands, 2, axis=0)
+    wind = jnp.array([2.0, 1.0, 0.2])
+    both = [fly(params, start, commands, wind=wind, name=name, engine=engine) for engine in ENGINES]
+    gap = np.linalg.norm(both[0].body.position_m - both[1].body.position_m, axis=1)
+    turn = angle_deg(both[0].body.quaternion, both[1].body.quaternion)
+    assert gap.max() < 0.01
+    assert turn.max() < 0.1
+    tilt = angle_deg(flown.body.quaternion, np.array([1.0, 0, 0, 0]))
+    assert tilt.max() > 10.0  # a flight that tests something
+
+
+def test_mjx_follows_mujoco_c_under_the_same_wrench():
+    spec, params = spec_of(), params_of()
+    hover = hover_speed(params)
+    time = DT * np.arange(N)[:, None]
+    commands = hover * (1 + 0.1 * np.sin(3 * time + np.array([0.0, 1.0, 2.0, 3.5])))
+    start = airborne(params, speed=hover)
+    states = fly(params, start, commands, wind=jnp.array([3.0, 0.0, 0.0]), engine="mjx")
+    before = jax.tree.map(lambda first, rest: np.concatenate([np.asarray(first)[None], rest[:-1]]), start, states)
+    load = jax.jit(jax.vmap(lambda s, c: step_loads(params, s, c, jnp.array([3.0, 0.0, 0.0]), plane(), DT)))(
+        before, jnp.asarray(commands, jnp.float32)
+    )
+    model = mujoco.MjModel.from_xml_string(multirotor_mjcf(spec, DT))
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0, 0, 100, 1, 0, 0, 0]
+    torque = np.einsum("nij,nj->ni", attitude(before.body.quaternion), np.asarray(load.torque_nm))
+    for force_n, torque_nm in zip(np.asarray(load.force_n), torque, strict=True):
+        data.xfrc_applied[1] = [*force_n, *torque_nm]
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(states.body.position_m[-1], data.qpos[:3], atol=2e-3)
+    assert angle_deg(states.body.quaternion[-1], data.qpos[3:]) < 0.01
+    np.testing.assert_allclose(states.body.angular_velocity_rad_s[-1], data.qvel[3:], atol=1e-3)
+    assert angle_deg(data.qpos[3:].copy(), [1.0, 0, 0, 0]) > 2.0
+
+
+@engines
+def test_sweeps_need_no_new_compilation(engine):
+    params = params_of()
+    step = make_multirotor_step(spec_of(), engine, DT)
+    run = jax.jit(jax.vmap(step, in_axes=(0, None, None, None, None)))
+    start = airborne(params, speed=hover_speed(params))
+    command = jnp.full(4, hover_speed(params))
+
+    def climb(masses):
+        swept = jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *x.shape)), params)
+        swept = replace(swept, mass_kg=jnp.array(masses))
+        return np.asarray(run(swept, start, command, CALM, plane()).body.velocity_m_s[:, 2]) / DT
+
+    np.testing.assert_allclose(climb([1.75, 3.5, 7.0]), GRAVITY * np.array([1.0, 0.0, -0.5]), atol=2e-2)
+    np.testing.assert_allclose(climb([3.5, 14.0, 3.5]), GRAVITY * np.array([0.0, -0.75, 0.0]), atol=2e-2)
+    assert run._cache_size() == 1
+
+
+@engines
+def test_gradients_are_finite_and_right(engine):
+    params, ground = params_of(), plane()
+    step = make_multirotor_step(spec_of(), engine, DT)
+    hover = hover_speed(params)
+
+    def height(mass, speed, start):
+        swept = replace(params, mass_kg=mass)
+        body = lambda state, _: (step(swept, state, jnp.full(4, speed), CALM, ground), None)  # noqa: E731
+        return jax.lax.scan(body, start, None, length=STEPS)[0].body.position_m[2]
+
+    gradient = jax.jit(jax.grad(height, argnums=(0, 1)))
+    in_air = airborne(params, speed=hover)
+    mass, speed = gradient(jnp.float32(3.5), jnp.float32(hover), in_air)
+    # d(height)/d(mass) of a constant thrust: -(thrust / m^2) t^2 / 2, summed over the semi-implicit steps.
+    assert float(mass) == pytest.approx(-GRAVITY / 3.5 * DT**2 * STEPS * (STEPS + 1) / 2, rel=1e-2)
+    assert float(speed) > 0.0
+    on_ground = airborne(params, height=0.219)
+    assert np.isfinite(gradient(jnp.float32(3.5), jnp.float32(100.0), on_ground)).all()
+
+
+@engines
+def test_a_broken_vehicle_stays_alone(engine):
+    params = params_of()
+    step = jax.jit(jax.vmap(make_multirotor_step(spec_of(), engine, DT), in_axes=(None, 0, 0, None, None)))
+    start = airborne(params, speed=hover_speed(params))
+    batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (3, *x.shape)), start)
+    commands = jnp.full((3, 4), 350.0)
+    sound = step(params, batch, commands, CALM, plane())
+    broken = step(params, batch, commands.at[1].set(jnp.nan), CALM, plane())
+    assert np.isnan(broken.body.position_m[1]).any()
+    for lane in (0, 2):
+        for a, b in zip(jax.tree.leaves(sound), jax.tree.leaves(broken), strict=True):
+            np.testing.assert_array_equal(a[lane], b[lane])
+
+
+def test_ground_effect_lifts_near_the_ground():
+    params = params_of()
+    speed = hover_speed(params)
+    low = fly(params, airborne(params, height=0.30, speed=speed), speed, steps=2)
+    factor = 1 / (1 - (0.19 / (4 * 0.30)) ** 2)
+    assert low.body.velocity_m_s[0, 2] / DT == pytest.approx(GRAVITY * (factor - 1), rel=1e-2)
+
+
+def test_energy_is_power_times_time():
+    params = params_of()
+    speed = hover_speed(params)
+    states = fly(params, airborne(params, speed=speed), speed, steps=N)
+    assert states.energy_j[-1] == pytest.approx((0.0399 * 3.5 * GRAVITY * speed / 0.8 + 25.0) * TIME[-1], rel=1e-4)
+
+
+def test_bad_choices_are_refused():
+    with pytest.raises(InputError, match="there is no engine 'bullet': choose one of mjx, analytic"):
+        make_multirotor_step(spec_of(), "bullet", DT)
+    with pytest.raises(InputError, match=r"time step of 0\.02 s is too long for the feet of tarot_t650"):
+        make_multirotor_step(spec_of(), "analytic", 0.02)
+    assert longest_time_step(spec_of("x500")) > DT

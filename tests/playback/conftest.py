@@ -1,0 +1,24 @@
+"""A mission and a site to show, made once."""
+
+import pytest
+
+from swarmsim.missions.record import MissionRecord
+from swarmsim.site.model import SiteModel
+from tests import synthetic
+
+
+@pytest.fixture(scope="session")
+def site() -> SiteModel:
+    return synthetic.site_model()
+
+
+@pytest.fixture(scope="session")
+def found() -> MissionRecord:
+    """A mission that found its source."""
+    return synthetic.mission()
+
+
+@pytest.fixture(scope="session")
+def nothing() -> MissionRecord:
+    """A mission over a site without a source, which found none."""
+    return synthetic.mission(found=False)

@@ -1,0 +1,190 @@
+"""What is on the figures, asked of the figures themselves."""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.text import Text
+
+from swarmsim.missions.record import MissionRecord
+from swarmsim.playback import figures, plan
+from swarmsim.site.model import SiteModel
+from tests import synthetic
+
+
+@pytest.fixture(autouse=True)
+def _style() -> Iterator[None]:
+    with plan.print_style():
+        yield
+
+
+def texts(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.findobj(Text) if text.get_visible() and text.get_text()]
+
+
+def labels(axes: Axes) -> list[str]:
+    legend = axes.get_legend()
+    assert legend is not None
+    return [text.get_text() for text in legend.get_texts()]
+
+
+def check_plan(axes: Axes) -> None:
+    """To scale, labelled with units, north up."""
+    assert axes.get_aspect() == 1.0
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("East [m]", "North [m]")
+    assert axes.get_ylim()[0] < axes.get_ylim()[1]
+    assert "N" in [text.get_text() for text in axes.texts]
+
+
+def test_trajectories_show_every_track_over_the_buildings(found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.trajectories(found, site)
+    axes = figure.axes[0]
+    check_plan(axes)
+    assert (*axes.get_xlim(), *axes.get_ylim()) == pytest.approx((-75, 75, -60, 60))
+    assert labels(axes) == ["uav1", "uav2", "uav3", "orpheus", "true source", "start", "buildings, trees"]
+    drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
+    for vehicle in found.vehicles:
+        track = drawn[vehicle.name]
+        assert np.ptp(track, axis=0) == pytest.approx(np.ptp(vehicle.position_m[:, :2], axis=0), abs=0.3)
+    shade = axes.images[0].get_array()
+    x, y = np.meshgrid(np.arange(-74.5, 75), np.arange(-59.5, 60))
+    inside = np.zeros(x.shape, bool)
+    for cx, cy, length, width, _ in synthetic.BUILDINGS:
+        inside |= (np.abs(x - cx) <= length / 2) & (np.abs(y - cy) <= width / 2)
+    np.testing.assert_array_equal(~np.ma.getmaskarray(shade), inside)
+
+
+def test_aerial_measurements_are_all_there_in_the_colour_of_their_rate(found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.aerial_measurements(found, site)
+    check_plan(figure.axes[0])
+    (dots,) = [c for c in figure.axes[0].collections if isinstance(c, PathCollection)]
+    samples = found.samples.of_phase("aerial")
+    np.testing.assert_allclose(np.asarray(dots.get_offsets()), samples.position_m[:, :2])
+    rates = np.asarray(dots.get_array())
+    expected = synthetic.rate_cps(samples.position_m)
+    assert np.abs(rates - expected).mean() < 0.25 * np.sqrt(expected.mean())  # eleven samples of a second averaged
+    assert "Count rate, 1 s mean [1/s]" in texts(figure)
+
+
+def test_map_shows_truth_hotspot_and_the_ellipse_of_95_percent(found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.radiation_map(found, site)
+    whole, close = figure.axes[:2]
+    for axes in (whole, close):
+        check_plan(axes)
+        np.testing.assert_array_equal(np.asarray(axes.images[-1].get_array()), found.map.mean_cps)
+        (ellipse,) = [p for p in axes.patches if isinstance(p, Ellipse)]
+        assert found.aerial_estimate is not None
+        assert ellipse.center == pytest.approx(tuple(found.aerial_estimate.position_m[:2]))
+        variances = np.linalg.eigvalsh(found.aerial_estimate.covariance_m2[:2, :2])
+        assert ellipse.width == pytest.approx(2 * np.sqrt(5.991 * variances[1]), rel=1e-3)
+        assert ellipse.height == pytest.approx(2 * np.sqrt(5.991 * variances[0]), rel=1e-3)
+    assert (*whole.get_xlim(), *whole.get_ylim()) == pytest.approx((-75, 75, -60, 60))
+    assert {"hotspot", "true source", "estimate from the air, 95 % ellipse"} <= set(labels(whole))
+    assert "Count rate, interpolated [1/s]" in texts(figure)
+    contours = [text for text in texts(figure) if text.isdigit() and 95 < int(text) < 240]
+    assert len(contours) >= 2
+
+
+def test_ellipse_holds_95_percent_of_a_normal_distribution(found: MissionRecord) -> None:
+    assert found.aerial_estimate is not None
+    covariance = found.aerial_estimate.covariance_m2
+    points = np.random.default_rng(1).multivariate_normal(np.zeros(2), covariance[:2, :2], 40_000)
+    width, height, angle = plan.ellipse_95(covariance)
+    turn = np.radians(angle)
+    along = points @ np.array([np.cos(turn), np.sin(turn)])
+    across = points @ np.array([-np.sin(turn), np.cos(turn)])
+    assert np.mean((2 * along / width) ** 2 + (2 * across / height) ** 2 < 1) == pytest.approx(0.95, abs=0.005)
+
+
+def test_ground_measurements_on_a_log_scale_with_a_close_up(found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.ground_measurements(found, site)
+    whole, close, bar = figure.axes
+    check_plan(whole)
+    check_plan(close)
+    assert bar.get_yscale() == "log"
+    centre = np.mean([close.get_xlim(), close.get_ylim()], axis=1)
+    assert found.estimate is not None
+    np.testing.assert_allclose(centre, found.estimate.position_m[:2])
+    assert np.ptp(close.get_xlim()) == pytest.approx(20.0)
+    dots = [c for c in close.collections if isinstance(c, PathCollection)]
+    assert len(dots[0].get_offsets()) == len(found.samples.of_phase("ground").time_s)
+    assert "planned route" in labels(whole)
+
+
+def test_spectrum_has_its_fit_lines_and_residuals(found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.spectrum(found, site)
+    upper, lower = figure.axes
+    assert upper.get_yscale() == "log"
+    assert lower.get_xlabel() == "Energy [keV]"
+    assert upper.get_ylabel() == "Counts per 11.7 keV"
+    assert found.spectrum is not None
+    measured = next(line for line in upper.lines if str(line.get_label()).startswith("measured"))
+    assert np.sum(measured.get_ydata()) == pytest.approx(found.spectrum.counts.sum())
+    places = {text.get_text(): text.get_position()[0] for text in upper.texts}
+    assert places == {"1173 keV": pytest.approx(1173.2), "1332 keV": pytest.approx(1332.5)}
+    residuals = np.asarray(lower.lines[-1].get_ydata())
+    assert residuals.std() == pytest.approx(1.0, abs=0.15)  # the fit is the truth here
+    assert "Co-60, confidence > 0.999" in texts(figure)
+
+
+@pytest.mark.parametrize("name", list(figures.FIGURES))
+def test_print_quality(name: str, found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.FIGURES[name](found, site)
+    figure.canvas.draw()
+    width = figure.get_figwidth()
+    assert width in (plan.SINGLE_COLUMN_IN, plan.DOUBLE_COLUMN_IN)
+    renderer = figure.canvas.get_renderer()
+    edge = figure.bbox
+    for text in figure.findobj(Text):
+        if not text.get_visible() or not text.get_text():
+            continue
+        assert text.get_fontsize() >= 6.9, text
+        box = text.get_window_extent(renderer)
+        axes = text.axes
+        if axes is None or not axes.bbox.overlaps(box):  # clipped tick labels have no place of their own
+            assert edge.x0 <= box.x0, text
+            assert box.x1 <= edge.x1, text
+            assert edge.y0 <= box.y0, text
+            assert box.y1 <= edge.y1, text
+
+
+def test_written_in_four_seconds_at_300_dpi(found: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
+    start = time.process_time()
+    written = figures.write(found, site, tmp_path / "figures")
+    assert time.process_time() - start < 4.0
+    assert [path.stem for path in written] == list(figures.FIGURES)
+    for path in written:
+        pixels = matplotlib.image.imread(path)
+        assert pixels.shape[1] in (1050, 2148)
+        colours = np.unique((pixels[..., :3].reshape(-1, 3) * 255).astype(np.uint8), axis=0)
+        assert len(colours) > 50
+        ink = (pixels[..., :3] < 0.98).any(axis=-1)
+        assert 0.03 < ink.mean() < 0.9
+        assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_mission_without_a_source(nothing: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
+    assert len(figures.write(nothing, site, tmp_path)) == 5
+    assert "No spectrum: nothing was found to identify." in texts(figures.spectrum(nothing, site))
+    assert "no measurements\non the ground" in texts(figures.ground_measurements(nothing, site))
+    whole = figures.radiation_map(nothing, site).axes[0]
+    assert labels(whole) == ["buildings, trees"]
+    # An even map is one colour, and the same in both panels.
+    first, second = (axes.images[-1] for axes in whole.figure.axes[:2])
+    assert first.norm.vmin == second.norm.vmin
+    assert first.norm.vmax == second.norm.vmax
+
+
+def test_flat_site_without_buildings_and_a_lost_vehicle(found: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
+    flat = dataclasses.replace(site, site=dataclasses.replace(site.site, surface_m=site.site.terrain_m))
+    lost = dataclasses.replace(found.vehicles[0], position_m=np.full_like(found.vehicles[0].position_m, np.nan))
+    record = dataclasses.replace(found, vehicles=(lost, *found.vehicles[1:]))
+    assert len(figures.write(record, flat, tmp_path)) == 5

@@ -1,0 +1,107 @@
+"""Solid angle and effective area of a cylinder against closed forms and rays."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.radiation.cylinder import (
+    absorbing_area,
+    direction_basis,
+    fit_effective_area,
+    projected_area,
+    solid_angle_per_area,
+)
+
+A, L = 0.0254, 0.0508
+
+
+def fraction(distance: float, u: float, dtype=jnp.float32) -> float:
+    u_, s_ = jnp.asarray(u, dtype), jnp.asarray(np.sqrt(1 - u * u), dtype)
+    a, length = jnp.asarray(A, dtype), jnp.asarray(L, dtype)
+    geometry = solid_angle_per_area(a, length, jnp.asarray(distance, dtype), u_, s_)
+    return float(geometry * projected_area(a, length, u_, s_))
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-3, 0.01, 0.1, 1.0, 20.0, 80.0, 500.0])
+def test_on_axis_is_the_disc(gap: float) -> None:
+    a = np.float64(A)
+    exact = 0.5 * a * a / (np.hypot(gap, a) * (np.hypot(gap, a) + gap))
+    assert fraction(gap + L / 2, 1.0) == pytest.approx(exact, rel=3e-4 if gap < 0.01 else 1e-5)
+
+
+@pytest.mark.parametrize("u", [0.0, 0.3, 0.7071, 0.95, 1.0])
+def test_far_away_is_the_silhouette(u: float) -> None:
+    area = 2 * A * L * np.sqrt(1 - u * u) + np.pi * A * A * u
+    for distance in (20.0, 100.0, 500.0):
+        assert fraction(distance, u) == pytest.approx(area / (4 * np.pi * distance**2), rel=0.003)
+
+
+@pytest.mark.parametrize("u", [0.0, 0.3, 0.7071, 0.95, 1.0])
+def test_contact_and_inside_see_half(u: float) -> None:
+    surface = min(L / 2 / max(u, 1e-9), A / max(np.sqrt(1 - u * u), 1e-9))
+    assert fraction(surface, u) == pytest.approx(0.5, abs=0.002)
+    assert fraction(0.5 * surface, u) == pytest.approx(0.5, abs=1e-6)
+
+
+@pytest.mark.parametrize("u", [0.0, 0.4, 0.8, 1.0])
+def test_float32_equals_float64(u: float) -> None:
+    surface = min(L / 2 / max(u, 1e-9), A / max(np.sqrt(1 - u * u), 1e-9))
+    for gap in np.geomspace(1e-3, 500.0, 25):
+        with jax.enable_x64(True):
+            reference = fraction(surface + gap, u, jnp.float64)
+        assert fraction(surface + gap, u) == pytest.approx(reference, rel=2e-4)
+
+
+@pytest.mark.parametrize("u", [0.0, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("distance", [0.1, 0.25, 1.0])
+def test_solid_angle_against_rays(u: float, distance: float) -> None:
+    """Isotropic rays in a cone about the crystal; 8 % near (two diameters), 2 % further off."""
+    rng = np.random.default_rng(3)
+    s = np.sqrt(1 - u * u)
+    origin = distance * np.array([s, 0.0, u])
+    opening = np.hypot(A, L / 2) / distance * 1.05
+    cosine = 1 - rng.random(200_000) * (1 - np.sqrt(1 - opening**2))
+    azimuth = 2 * np.pi * rng.random(len(cosine))
+    sine = np.sqrt(1 - cosine**2)
+    e1, e2, e3 = np.array([u, 0, -s]), np.array([0.0, 1, 0]), -origin / distance
+    ray = cosine[:, None] * e3 + sine[:, None] * (np.cos(azimuth)[:, None] * e1 + np.sin(azimuth)[:, None] * e2)
+    hit = np.mean(_hits(origin, ray)) * 0.5 * (1 - np.sqrt(1 - opening**2))
+    assert fraction(distance, u) == pytest.approx(hit, rel=0.08 if distance < 0.2 else 0.03)
+
+
+def _hits(origin: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        qa = ray[:, 0] ** 2 + ray[:, 1] ** 2
+        qb = origin[0] * ray[:, 0] + origin[1] * ray[:, 1]
+        discriminant = qb**2 - qa * (origin[0] ** 2 + origin[1] ** 2 - A * A)
+        root = np.sqrt(np.maximum(discriminant, 0))
+        z = np.sort(np.stack([(-L / 2 - origin[2]) / ray[:, 2], (L / 2 - origin[2]) / ray[:, 2]]), axis=0)
+        return (discriminant > 0) & (np.maximum((-qb - root) / qa, z[0]) < np.minimum((-qb + root) / qa, z[1]))
+
+
+def test_absorbing_area_limits() -> None:
+    for u in (0.0, 0.3, 0.8, 1.0):
+        thin, thick = absorbing_area(A, L, u, np.array([1e-3, 1e6]))
+        assert thin == pytest.approx(1e-3 * np.pi * A * A * L, rel=2e-3)
+        assert thick == pytest.approx(2 * A * L * np.sqrt(1 - u * u) + np.pi * A * A * u, rel=0.01)
+
+
+def test_end_on_and_side_on_closed_forms() -> None:
+    """End-on every chord is L; side-on they are 2 sqrt(a^2 - x^2)."""
+    mu = np.array([20.0, 60.0, 400.0])
+    x = np.linspace(-A, A, 40_001)
+    chord = 2 * np.sqrt(np.maximum(A * A - x * x, 0))
+    side = [L * np.trapezoid(-np.expm1(-m * chord), x) for m in mu]
+    fitted = fit_effective_area(A, L, mu)
+    end_on, side_on = direction_basis(jnp.float32(1), jnp.float32(0)), direction_basis(jnp.float32(0), jnp.float32(1))
+    np.testing.assert_allclose(fitted @ np.asarray(end_on), np.pi * A * A * -np.expm1(-mu * L), rtol=0.002)
+    np.testing.assert_allclose(fitted @ np.asarray(side_on), side, rtol=0.003)
+
+
+def test_fit_between_is_within_one_percent() -> None:
+    mu = np.geomspace(15.0, 3000.0, 7)
+    fitted = fit_effective_area(A, L, mu)
+    for u in np.cos(np.linspace(0.02, 1.55, 9)):
+        basis = np.asarray(direction_basis(jnp.float32(u), jnp.float32(np.sqrt(1 - u * u))))
+        np.testing.assert_allclose(fitted @ basis, absorbing_area(A, L, float(u), mu), rtol=0.012)

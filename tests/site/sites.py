@@ -1,0 +1,70 @@
+"""Small sites and files for the tests of the site room."""
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+
+from swarmsim.config.site import SiteSpec
+from swarmsim.site import Obstacles, Site
+
+MATERIALS = ("air", "brick", "concrete", "soil", "steel", "vegetation", "wood")
+
+
+def make_site(boxes=(), terrain=None, cell=1.0, origin=(-300.0, -300.0), materials=MATERIALS):
+    """A site with ``boxes`` (centre, half, yaw, wall, material) on ``terrain`` [ny, nx]; deep below zero by default."""
+    terrain = np.full((601, 601), -1e3) if terrain is None else np.asarray(terrain)
+    boxes = boxes or (((0, 0, 0), (0, 0, 0), 0.0, 0.0, materials[0]),)
+    centre, half, yaw, wall, names = zip(*boxes, strict=True)
+    yaw = np.array(yaw)
+    raster = jnp.asarray(terrain, jnp.float32)
+    return Site(
+        origin_m=jnp.array(origin, jnp.float32),
+        cell_m=jnp.float32(cell),
+        terrain_m=raster,
+        surface_m=raster,
+        clearance_m=jnp.ones_like(raster),
+        cost=jnp.ones_like(raster),
+        obstacles=Obstacles(
+            centre_m=jnp.array(centre, jnp.float32),
+            half_extent_m=jnp.array(half, jnp.float32),
+            axis=jnp.asarray(np.stack([np.cos(yaw), np.sin(yaw)], -1), jnp.float32),
+            wall_m=jnp.array(wall, jnp.float32),
+            material=jnp.array([materials.index(n) for n in names], jnp.int32),
+        ),
+        survey_area_m=jnp.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]),
+        ground_material=jnp.int32(materials.index("soil")),
+        material_names=tuple(materials),
+    )
+
+
+def spec(**fields) -> SiteSpec:
+    """A specification with cells of half a metre."""
+    return SiteSpec(**{"name": "here", "file": "here.glb", "licence": "made for a test", "cell_m": 0.5} | fields)
+
+
+def ground_plate(size=(40.0, 30.0), slope=0.0, pieces=20) -> trimesh.Trimesh:
+    """A plate around the origin that rises towards the east."""
+    x, y = (np.linspace(-0.5 * s, 0.5 * s, pieces + 1) for s in size)
+    points = np.stack(np.meshgrid(x, y), -1)
+    points = np.concatenate([points, slope * points[..., :1]], -1)
+    index = np.arange(points.shape[0] * points.shape[1]).reshape(points.shape[:2])
+    a, b, c, d = (q.ravel() for q in (index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]))
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    return trimesh.Trimesh(points.reshape(-1, 3), faces, process=False)
+
+
+def block(size, centre, yaw=0.0) -> trimesh.Trimesh:
+    """A closed box."""
+    mesh = trimesh.creation.box(size)
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(yaw, [0, 0, 1]))
+    mesh.apply_translation(centre)
+    return mesh
+
+
+def yard(slope=0.0) -> trimesh.Scene:
+    """A plate of 40 m x 30 m with a house of 8 x 6 x 5 m at (5, 3), turned by 0.3 rad, and a post of 3 m at (-10, -5)."""
+    scene = trimesh.Scene()
+    scene.add_geometry(ground_plate(slope=slope), geom_name="plate")
+    scene.add_geometry(block((8, 6, 5), (5, 3, 2.5), 0.3), geom_name="house")
+    scene.add_geometry(block((0.4, 0.4, 3), (-10, -5, 1.5)), geom_name="post")
+    return scene

@@ -1,0 +1,157 @@
+"""Path lengths against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sites import MATERIALS, make_site
+
+from swarmsim.site import path_lengths
+
+lengths_of = jax.jit(path_lengths)
+
+
+def lengths(site, a, b):
+    found = np.asarray(lengths_of(site, jnp.array(a, jnp.float32), jnp.array(b, jnp.float32)))
+    return dict(zip(MATERIALS, found, strict=True))
+
+
+def test_solid_box_across_its_middle_and_its_diagonal():
+    site = make_site([((1.0, 2.0, 3.0), (2.0, 1.0, 0.5), 0.0, 0.0, "concrete")])
+    assert lengths(site, (-20, 2, 3), (20, 2, 3))["concrete"] == pytest.approx(4.0, rel=1e-6)
+    diagonal = np.array([2.0, 1.0, 0.5])
+    middle = np.array([1.0, 2.0, 3.0])
+    through = lengths(site, middle - 3 * diagonal, middle + 3 * diagonal)
+    assert through["concrete"] == pytest.approx(2 * np.linalg.norm(diagonal), rel=1e-5)
+    assert through["air"] == pytest.approx(4 * np.linalg.norm(diagonal), rel=1e-5)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4, np.pi / 2, 2.5])
+def test_shell_counts_its_two_walls(yaw):
+    site = make_site([((0.0, 0.0, 5.0), (4.0, 3.0, 5.0), yaw, 0.2, "brick")])
+    ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    across = lengths(site, 20 * ahead + [0, 0, 5], -20 * ahead + [0, 0, 5])
+    assert across["brick"] == pytest.approx(0.4, rel=1e-4)
+    from_inside = lengths(site, (0, 0, 5), 20 * ahead + [0, 0, 5])
+    assert from_inside["brick"] == pytest.approx(0.2, rel=1e-4)
+    inside = lengths(site, (0, 0, 4), 2 * ahead + [0, 0, 4])
+    assert inside["brick"] == 0.0
+
+
+def test_shell_thicker_than_its_box_is_solid():
+    site = make_site([((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.0, 1.5, "steel")])
+    assert lengths(site, (-5, 0, 0), (5, 0, 0))["steel"] == pytest.approx(2.0, rel=1e-6)
+
+
+def test_thin_wall_keeps_its_thickness_at_500_m():
+    site = make_site([((0.0, 0.0, 0.0), (0.002, 50.0, 50.0), 0.0, 0.0, "steel")])
+    assert lengths(site, (-250, 10, 3), (250, 10, 3))["steel"] == pytest.approx(0.004, rel=0.02)
+    assert lengths(site, (-0.005, 0, 0), (0.005, 0, 0))["steel"] == pytest.approx(0.004, rel=1e-4)
+
+
+def test_contact_of_a_centimetre():
+    site = make_site([((40.0, 30.0, 1.0), (1.0, 1.0, 1.0), 0.0, 0.0, "concrete")])
+    through = lengths(site, (38.995, 30, 1), (39.005, 30, 1))
+    assert through["concrete"] == pytest.approx(0.005, rel=2e-3)
+    assert sum(through.values()) == pytest.approx(0.01, rel=2e-3)
+
+
+def slope_site(rise):
+    x = np.arange(-300.0, 301.0)
+    return make_site(terrain=np.tile(rise * x, (601, 1)))
+
+
+@pytest.mark.parametrize(("a", "b"), [((-100, 0, 5), (100, 0, -3)), ((0, 0, 1), (3, 2, -1)), ((-200, 50, 20), (250, 60, 9))])
+def test_ground_below_a_slope(a, b):
+    """Below the plane z = 0.1 x: the share of the segment where z - 0.1 x < 0."""
+    site = slope_site(0.1)
+    above_a, above_b = a[2] - 0.1 * a[0], b[2] - 0.1 * b[0]
+    assert above_a > 0 > above_b
+    expected = -above_b / (above_a - above_b) * np.linalg.norm(np.subtract(b, a))
+    assert lengths(site, a, b)["soil"] == pytest.approx(expected, rel=2e-3)
+
+
+def test_ground_wholly_above_and_wholly_below():
+    site = slope_site(0.0)
+    assert lengths(site, (-5, 0, 0.5), (80, 3, 0.1))["soil"] == 0.0
+    assert lengths(site, (-5, 0, -0.5), (7, 0, -0.5))["soil"] == pytest.approx(12.0, rel=1e-6)
+
+
+def test_ground_length_is_continuous_in_the_end():
+    """A hill's crossing moves smoothly with the ray: no jump between samples."""
+    x = np.arange(-300.0, 301.0)
+    site = make_site(terrain=np.tile(3.0 * np.exp(-((x / 8.0) ** 2)), (601, 1)))
+    heights = jnp.linspace(0.0, 6.0, 1201)
+    ends = jnp.stack([jnp.full_like(heights, 60.0), jnp.zeros_like(heights), heights], -1)
+    soil = jax.vmap(lambda b: path_lengths(site, jnp.array([-60.0, 0.0, 0.5]), b))(ends)[:, MATERIALS.index("soil")]
+    assert soil[0] > 15.0
+    assert float(soil[-1]) < 10.0
+    assert np.abs(np.diff(soil)).max() < 0.2
+
+
+def test_overlapping_boxes_and_ground_never_exceed_the_distance():
+    boxes = [((0, 0, 0), (3, 3, 3), 0.0, 0.0, "concrete"), ((1, 0, 0), (3, 3, 3), 0.3, 0.0, "brick")]
+    site = make_site(boxes, terrain=np.full((601, 601), 2.0))
+    found = lengths(site, (-2, 0, 0), (2, 0, 0))
+    assert sum(found.values()) == pytest.approx(4.0, rel=1e-5)
+    assert found["air"] == 0.0
+
+
+BOXES = [
+    ((0, 0, 0), (3, 2, 4), 0.3, 0.2, "brick"), ((2, 1, 0), (1, 1, 1), 0.0, 0.0, "steel"),
+    ((-4, 3, 1), (2, 0.1, 3), 1.2, 0.0, "concrete"), ((0, -5, 2), (0.5, 4, 0.5), 0.0, 0.05, "wood"),
+]  # fmt: skip
+UNDULATING = make_site(BOXES, terrain=np.add.outer(np.zeros(601), np.sin(np.arange(-300, 301) / 5.0)))
+coordinate = st.one_of(st.integers(-6, 6).map(float), st.floats(-250, 250, width=32))
+point = st.tuples(coordinate, coordinate, coordinate)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(a=point, b=point)
+def test_properties_of_any_ray(a, b):
+    """Finite, never negative, the sum is the distance, the same in both directions."""
+    there = np.array(list(lengths(UNDULATING, a, b).values()))
+    back = np.array(list(lengths(UNDULATING, b, a).values()))
+    distance = float(np.linalg.norm(np.subtract(b, a)))
+    assert np.isfinite(there).all()
+    assert (there >= -1e-4).all()
+    assert there.sum() == pytest.approx(distance, rel=1e-4, abs=1e-6)
+    np.testing.assert_allclose(there, back, atol=2e-3 + 1e-4 * distance)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(a=point, b=point)
+def test_box_lengths_equal_dense_sampling(a, b):
+    site = make_site([BOXES[0]])
+    t = (np.arange(20_000) + 0.5) / 20_000
+    p = np.array(a) + t[:, None] * np.subtract(b, a)
+    c, s = np.cos(0.3), np.sin(0.3)
+    local = np.abs(np.stack([c * p[:, 0] + s * p[:, 1], c * p[:, 1] - s * p[:, 0], p[:, 2]], -1))
+    matter = (local <= [3, 2, 4]).all(1) & ~(local <= [2.8, 1.8, 3.8]).all(1)
+    distance = float(np.linalg.norm(np.subtract(b, a)))
+    on_face = any(abs(x) in (2.0, 3.0, 4.0) for x in (a[2], b[2])) and a[2] == b[2]
+    if not on_face:  # in the plane of a face, inside and outside are the same
+        assert lengths(site, a, b)["brick"] == pytest.approx(matter.mean() * distance, abs=2e-3 + 3e-4 * distance)
+
+
+@pytest.mark.parametrize("b", [(0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.0, -9.0), (4.0, -3.0, 2.0)])
+def test_gradient_is_finite(b):
+    def total(a, b):
+        return path_lengths(UNDULATING, a, b) @ jnp.arange(1.0, len(MATERIALS) + 1.0)
+
+    for gradient in jax.grad(total, argnums=(0, 1))(jnp.zeros(3), jnp.array(b)):
+        assert np.isfinite(gradient).all()
+
+
+def test_gradient_equals_difference():
+    site = make_site([((0, 0, 0), (3, 2, 4), 0.3, 0.0, "brick")])
+    a, b = jnp.array([-10.0, 1.0, 1.0]), jnp.array([12.0, 0.5, 2.0])
+    brick = MATERIALS.index("brick")
+    gradient = jax.grad(lambda b: path_lengths(site, a, b)[brick])(b)
+    step = 0.05
+    difference = [
+        (lengths(site, a, b + step * e)["brick"] - lengths(site, a, b - step * e)["brick"]) / (2 * step) for e in jnp.eye(3)
+    ]
+    np.testing.assert_allclose(gradient, difference, atol=2e-3)
