@@ -98,7 +98,7 @@ def check_out(folder: Path, force: bool) -> None:
 
 def read_summary(folder: Path) -> dict[str, Any]:
     """The content of a run's summary."""
-    summary: dict[str, Any] = json.loads((folder / SUMMARY).readvalue_text(encoding="utf-8"))
+    summary: dict[str, Any] = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))
     return summary
 
 
@@ -120,6 +120,9 @@ def summary_table(summary: dict[str, Any], name: str, missions: int = 1) -> Tabl
     for vehicle in summary.get("vehicles", ()):
         state = "crashed" if vehicle["crashed"] else "intact"
         table.add_row(f"Vehicle {vehicle['name']}", f"{state}, {value_text(vehicle['energy_wh'])}", "Wh")
+    for event in summary.get("events", ()):
+        if event["kind"] not in ("landed", "finished"):
+            table.add_row(f"{event['vehicle']} at {event['time_s']:.0f} s", f"{event['kind']}: {event['detail']}", "")
     return table
 
 

@@ -273,7 +273,7 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
         _vehicle("orpheus", "skid_steer", route, 0.9 if found else 0.0, aerial_end + 1.0, time),
     )
     samples = _samples(vehicles, aerial_end, sample_hz, ACTIVITY_MBQ if found else 0.0, rng)
-    phases = (Phase("aerial", 0.0, aerial_end),)
+    phases = (Phase("aerial survey", 0.0, aerial_end),)
     estimate = Estimate(
         position_m=SOURCE_M + np.array([0.12, -0.09, 0.2]),
         covariance_m2=np.array([[0.020, 0.006, 0.0], [0.006, 0.012, 0.0], [0.0, 0.0, 0.09]]),
@@ -294,7 +294,7 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
         name="synthetic",
         site="synthetic",
         seed=seed,
-        phases=(*phases, Phase("ground", aerial_end, aerial_end + drive)) if found else phases,
+        phases=(*phases, Phase("ground search", aerial_end, aerial_end + drive)) if found else phases,
         vehicles=vehicles,
         samples=samples,
         map=_map(samples, 2.0, found),

@@ -21,11 +21,11 @@ VALUES_MAX = 200_000
 _TAG = "tag:yaml.org,2002:"
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
-_CORE: tuple[tuple[str, re.Pattern[str], str], ...] = (
-    ("null", re.compile(r"~|null|Null|NULL|"), "~nN\0"),
-    ("bool", re.compile(r"true|True|TRUE|false|False|FALSE"), "tTfF"),
-    ("int", re.compile(rf"(?:{_INT.pattern})$"), "-+0123456789"),
-    ("float", re.compile(rf"(?:{_FLOAT.pattern})$"), "-+.0123456789"),
+_CORE: tuple[tuple[str, re.Pattern[str], list[str]], ...] = (  # kind, what it looks like, how it may begin
+    ("null", re.compile(r"~|null|Null|NULL|"), [*"~nN", ""]),
+    ("bool", re.compile(r"true|True|TRUE|false|False|FALSE"), [*"tTfF"]),
+    ("int", re.compile(rf"(?:{_INT.pattern})$"), [*"-+0123456789"]),
+    ("float", re.compile(rf"(?:{_FLOAT.pattern})$"), [*"-+.0123456789"]),
 )
 
 
@@ -80,7 +80,7 @@ class _Dumper(yaml.SafeDumper):
 
 for _kind, _pattern, _first in _CORE:
     _anchored = re.compile(rf"^(?:{_pattern.pattern})$")
-    _Loader.add_implicit_resolver(_TAG + _kind, _anchored, list(_first.replace("\0", "")) + [""] * ("\0" in _first))
+    _Loader.add_implicit_resolver(_TAG + _kind, _anchored, _first)
 _Dumper.add_implicit_resolver(_TAG + "float", re.compile(rf"^(?:{_FLOAT.pattern})$"), list("-+.0123456789"))
 _Dumper.add_implicit_resolver(_TAG + "int", re.compile(rf"^(?:{_INT.pattern})$"), list("-+0123456789"))
 

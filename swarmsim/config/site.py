@@ -52,8 +52,8 @@ class SiteSpec(Model):
 
     ``unit_m`` and ``up_axis`` override what the file says of itself. ``ground`` are patterns of the mesh materials or
     geometries that are bare ground; without them the ground is told from the shape. ``extent_m`` is what the longer
-    side of a mesh may measure, a guard against wrong units; ``holes_max`` the fraction of the ground that may be missing
-    and is then filled by interpolation.
+    side of a mesh may measure, a guard against wrong units; ``holes_max`` is the fraction of the ground that may be
+    missing and is then filled by interpolation.
     """
 
     name: Name

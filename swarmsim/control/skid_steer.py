@@ -42,11 +42,11 @@ def wheel_speeds(
 def pursue(
     params: SkidSteerParams, state: SkidSteerState, target_xy: jax.Array, speed_m_s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Speed ahead [] (m/s) and yaw rate [] (rad/s) that lead to ``target_xy`` [2] (m, world) at ``speed_m_s`` [] or less.
+    """Speed ahead [] (m/s) and yaw rate [] (rad/s) to ``target_xy`` [2] (m, world) at ``speed_m_s`` [] or less.
 
     Pure pursuit (Coulter, CMU-RI-TR-92-01): the arc through the target, tangent to the heading. A target far off the
-    nose is turned to in place. The rover slows down so as to stop at the target, takes curves no faster than its yaw-rate
-    limit allows, and changes its speed no faster than its acceleration limit.
+    nose is turned to in place. The rover slows down so as to stop at the target, takes curves no faster than its
+    yaw-rate limit allows, and changes its speed no faster than its acceleration limit.
     """
     offset = target_xy - state.body.position_m[:2]
     distance = jnp.sqrt(jnp.sum(offset * offset) + 1e-12)

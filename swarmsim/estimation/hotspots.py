@@ -33,18 +33,21 @@ def extract_hotspots(params: MappingParams, radiation_map: RadiationMap) -> Hots
     for window in ((width, 1), (1, width)):
         highest = jax.lax.reduce_window(highest, -jnp.inf, jax.lax.max, window, (1, 1), "SAME")
     peak = (significance >= highest) & (significance >= params.significance_sigma)
-    candidates = jnp.where(peak, significance, -jnp.inf).reshape(-1)
-    count = min(params.hotspots_max, nx * ny)
-    value, index = jax.lax.top_k(candidates, count)
-    value = jnp.pad(value, (0, params.hotspots_max - count), constant_values=-jnp.inf)
-    index = jnp.pad(index, (0, params.hotspots_max - count))
+    row, column = jnp.arange(ny)[:, None], jnp.arange(nx)
+
+    def strongest(candidates: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        index = jnp.argmax(candidates)
+        # Equal neighbours are all peaks: the first of them stands for the others.
+        reach = jnp.maximum(jnp.abs(row - index // nx), jnp.abs(column - index % nx))
+        return jnp.where(reach > params.separation_cells, candidates, -jnp.inf), (index, jnp.max(candidates))
+
+    candidates = jnp.where(peak, significance, -jnp.inf)
+    _, (index, value) = jax.lax.scan(strongest, candidates, None, length=params.hotspots_max)
     valid = jnp.isfinite(value)
-    best = jnp.argmax(significance)
-    index = jnp.where(valid, index, best)
-    cell = jnp.stack([index % nx, index // nx], axis=-1)
+    index = jnp.where(valid, index, jnp.argmax(significance))
     return Hotspots(
-        position_m=params.origin_m + params.cell_m * cell,
-        significance=jnp.where(valid, value, significance.reshape(-1)[best]),
+        position_m=params.origin_m + params.cell_m * jnp.stack([index % nx, index // nx], axis=-1),
+        significance=significance.reshape(-1)[index],
         valid=valid,
     )
 

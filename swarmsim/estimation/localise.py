@@ -2,10 +2,10 @@
 
 Two stages, because rays through walls and terrain cost a hundred times what the rest of the likelihood does:
 
-1. Adam (optax) with a cosine-decayed step from several starts. The exact net rates r0 are computed at the start of
-   each of `SEGMENTS` segments; within one, r = r0 d0² / d² with d the distance to the crystal, the only part that
-   changes quickly. What is held (attenuation, build-up, direction) changes r by a few per cent over the few metres of
-   a segment, and is exact again at the next.
+1. Adam (optax) with a cosine-decayed step from several starts. The exact net rates r0, and the activity and the
+   background that fit them best, are computed at the start of each of `SEGMENTS` segments; within one,
+   r = r0 d0² / d² with d the distance to the crystal, the only part that changes quickly. What is held (attenuation,
+   build-up, direction) changes r by a few per cent over the few metres of a segment, and is exact again at the next.
 2. From the best end point, by exact likelihood: damped Fisher scoring (Levenberg–Marquardt on the Poisson likelihood,
    Osborne 1992) in which every evaluation uses exact path lengths. It removes what the first stage left, and its
    fixed point is that of the exact likelihood.
@@ -167,8 +167,8 @@ def _background_only(problem: FitProblem) -> tuple[jax.Array, jax.Array]:
     return log_scale, poisson_log_likelihood(m.counts, expected_counts(problem, none, log_scale), m.valid)
 
 
-def _profile(problem: FitProblem, rates: jax.Array, log_scale: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Best log activity and log scale [] at a held position with net rates ``rates`` [n] per becquerel."""
+def _profile(problem: FitProblem, rates: jax.Array, log_scale: jax.Array) -> jax.Array:
+    """Best log activity and log scale [2] at a held position with net rates ``rates`` [n] per becquerel."""
     m = problem.measurements
     # Start where the source gives as much as the background to the windows that see it best.
     brightest = jnp.max(jnp.where(m.valid, rates, 0.0))
@@ -184,8 +184,7 @@ def _profile(problem: FitProblem, rates: jax.Array, log_scale: jax.Array) -> tup
         delta = scaled_inverse(f) @ (j @ ((m.counts - mean) / mean))
         return jnp.clip(v + jnp.clip(delta, -LOG_STEP, LOG_STEP), *jnp.array([LOG_ACTIVITY, LOG_SCALE]).T)
 
-    v = jax.lax.fori_loop(0, PROFILE_STEPS, step, jnp.stack([jnp.clip(start, *LOG_ACTIVITY), log_scale]))
-    return v[0], v[1]
+    return jax.lax.fori_loop(0, PROFILE_STEPS, step, jnp.stack([jnp.clip(start, *LOG_ACTIVITY), log_scale]))
 
 
 def _search(
@@ -201,28 +200,24 @@ def _search(
     height_rate = jnp.where(params.height_std_m > FIXED_STD_M, jnp.minimum(params.height_std_m, 1.0), 0.0)
     rate = params.learning_rate_m * jnp.concatenate([jnp.ones(2), height_rate[None], jnp.array(LOG_RATES)])
 
-    def exact(theta: jax.Array) -> jax.Array:
-        return jax.lax.map(lambda t: _exact_rates(problem, t), theta)
-
     low, high = bounds
     zero = jnp.zeros(initial_xy.shape[0])
     columns = (initial_xy[:, 0], initial_xy[:, 1], zero + problem.height_m, zero, zero + log_scale)
     theta = jnp.clip(jnp.stack(columns, axis=-1), low, high)
-    logs = jax.vmap(lambda r: _profile(problem, r, log_scale))(exact(theta))
-    theta = theta.at[:, 3:].set(jnp.stack(logs, axis=-1))
     gradient = jax.vmap(jax.grad(_held_loss), (0, 0, 0, None))
 
     Carry = tuple[jax.Array, optax.OptState]
 
     def segment(carry: Carry, _: None) -> tuple[Carry, None]:
-        anchor, rates = carry[0], exact(carry[0])
+        rates = jax.lax.map(lambda t: _exact_rates(problem, t), carry[0])
+        anchor = carry[0].at[:, 3:].set(jax.vmap(lambda r: _profile(problem, r, log_scale))(rates))
 
         def iteration(carry: Carry, _: None) -> tuple[Carry, None]:
             theta, memory = carry
             update, memory = optimiser.update(gradient(theta, anchor, rates, problem), memory)
             return (jnp.clip(theta + rate * update, low, high), memory), None
 
-        return jax.lax.scan(iteration, carry, None, length=per_segment)[0], None
+        return jax.lax.scan(iteration, (anchor, carry[1]), None, length=per_segment)[0], None
 
     return jax.lax.scan(segment, (theta, optimiser.init(theta)), None, length=SEGMENTS)[0][0]
 
@@ -265,22 +260,25 @@ def _polish(
     best place is a kink of the likelihood.
     """
     reach = jnp.array([POSITION_STEP_M, POSITION_STEP_M, POSITION_STEP_M, LOG_STEP, LOG_STEP])
-    Carry = tuple[jax.Array, Evaluation, jax.Array]
+    Carry = tuple[jax.Array, Evaluation, jax.Array, jax.Array]
 
     def step(carry: Carry, _: None) -> tuple[Carry, jax.Array]:
-        theta, here, damping = carry
+        theta, here, damping, trial = carry
+        there = evaluate(problem, trial)
+        better = there.log_posterior >= here.log_posterior
+        theta, here = jax.tree.map(lambda a, b: jnp.where(better, a, b), (trial, there), (theta, here))
+        damping = jnp.clip(damping * jnp.where(better, 0.1, 10.0), 1e-6, 1e4)
         damped = here.information + damping * jnp.diag(jnp.diagonal(here.information))
         move = scaled_inverse(damped) @ here.score
         move = move * jnp.minimum(1.0, jnp.min(reach / jnp.maximum(jnp.abs(move), 1e-9)))
-        trial = jnp.clip(theta + move, *bounds)
-        there = evaluate(problem, trial)
-        better = there.log_posterior >= here.log_posterior
-        chosen = jax.tree.map(lambda a, b: jnp.where(better, a, b), (trial, there), (theta, here))
-        return (*chosen, jnp.clip(damping * jnp.where(better, 0.1, 10.0), 1e-6, 1e4)), here.log_posterior
+        return (theta, here, damping, jnp.clip(theta + move, *bounds)), here.log_posterior
 
-    start = (theta, evaluate(problem, theta), jnp.asarray(1e-3))
-    (theta, here, _), before = jax.lax.scan(step, start, None, length=steps)
-    return theta, here, here.log_posterior - before[-max(1, steps // 3)] < SETTLED_NATS
+    unknown = -jnp.asarray(jnp.inf)
+    nowhere = Evaluation(
+        log_likelihood=unknown, log_posterior=unknown, score=jnp.zeros(5), information=jnp.eye(5)
+    )  # worse than any place: the first trial, the start itself, is taken
+    (theta, here, _, _), course = jax.lax.scan(step, (theta, nowhere, jnp.asarray(1e-2), theta), None, length=steps + 1)
+    return theta, here, course[-1] - course[-1 - max(1, steps // 3)] < SETTLED_NATS
 
 
 def _report(

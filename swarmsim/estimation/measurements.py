@@ -24,10 +24,10 @@ def aggregate(measurements: Measurements, per_window: int) -> Measurements:
 
     Counts and exposures add up (a sum of Poisson variables is Poisson); the position is the exposure-weighted mean,
     the axis the exposure-weighted mean made a unit vector again, the time that of the last valid sample, the detector
-    that of the first. The rate at the mean position differs from the mean rate by about (v T)² / 24 times the rate's
-    curvature: 0.3 % for a window of 2.5 m seen from 20 m. Samples must be ordered so that a window holds one vehicle
-    (and one detector) only: aggregate each vehicle's own samples (vmap over vehicles), then `concatenate`. A
-    remainder shorter than a window makes a last, shorter window.
+    that of the first valid one. The rate at the mean position differs from the mean rate by about (v T)² / 24 times
+    the rate's curvature: 0.3 % for a window of 2.5 m seen from 20 m. Samples must be ordered so that a window holds
+    one vehicle (and one detector) only: aggregate each vehicle's own samples (vmap over vehicles), then
+    `concatenate`. A remainder shorter than a window makes a last, shorter window.
 
     Args:
         measurements: n samples.
@@ -48,23 +48,23 @@ def aggregate(measurements: Measurements, per_window: int) -> Measurements:
         padded = jnp.pad(x, [(0, windows * per_window - n)] + [(0, 0)] * (x.ndim - 1))
         return padded.reshape(windows, per_window, *x.shape[1:])
 
-    m = jax.tree.map(windowed, measurements)
-    exposure = jnp.where(m.valid, m.exposure_s, 0.0)
-    total = jnp.sum(exposure, axis=1)
-    weight = (exposure / jnp.maximum(total, 1e-12)[:, None])[..., None]
-    # Positions relative to the window's first sample: a mean of large coordinates would lose digits in float32.
-    first = m.position_m[:, 0]
-    offset = jnp.where(m.valid[..., None], m.position_m - first[:, None], 0.0)
-    axis = jnp.sum(weight * jnp.where(m.valid[..., None], m.axis, 0.0), axis=1)
+    m = jax.tree.map(windowed, cleared(measurements))
+    total = jnp.sum(m.exposure_s, axis=1)
+    weight = (m.exposure_s / jnp.maximum(total, 1e-12)[:, None])[..., None]
+    # Positions relative to one of the window's own: a mean of large coordinates would lose digits in float32.
+    first = jnp.argmax(m.valid, axis=1)
+    origin = jnp.take_along_axis(m.position_m, first[:, None, None], axis=1)
+    offset = jnp.sum(weight * (m.position_m - origin), axis=1)
+    axis = jnp.sum(weight * m.axis, axis=1)
     norm = jnp.linalg.norm(axis, axis=-1, keepdims=True)
     return Measurements(
-        time_s=jnp.max(jnp.where(m.valid, m.time_s, -jnp.inf), axis=1, initial=0.0),  # mission clocks start at zero
-        position_m=first + jnp.sum(weight * offset, axis=1),
+        time_s=jnp.max(m.time_s, axis=1),
+        position_m=origin[:, 0] + offset,
         axis=jnp.where(norm > 1e-6, axis / jnp.maximum(norm, 1e-6), jnp.array([0.0, 0.0, 1.0])),
-        counts=jnp.sum(jnp.where(m.valid, m.counts, 0), axis=1),
+        counts=jnp.sum(m.counts, axis=1),
         exposure_s=total,
-        valid=jnp.any(m.valid, axis=1) & (total > 0.0),
-        detector=m.detector[:, 0],
+        valid=jnp.any(m.valid, axis=1),
+        detector=jnp.take_along_axis(m.detector, first[:, None], axis=1)[:, 0],
     )
 
 

@@ -79,7 +79,8 @@ def mapping_params(spec: Mapping, area_m: ArrayLike, variance_kept: float = VARI
     if shape.prod() > CELLS_MAX:
         raise InputError.of(
             f"mapping.cell_m of {spec.cell_m:g} m makes a map of {shape[0]} x {shape[1]} cells over an area of "
-            f"{extent[0]:.0f} x {extent[1]:.0f} m; at most {CELLS_MAX} cells are possible: give a larger cell_m or a smaller area"
+            f"{extent[0]:.0f} x {extent[1]:.0f} m; at most {CELLS_MAX} cells are possible: give a larger cell_m or a "
+            "smaller area"
         )
     origin = low + 0.5 * (extent - (shape - 1) * spec.cell_m)
     cells = [origin[i] + spec.cell_m * np.arange(shape[i]) for i in range(2)]
@@ -133,8 +134,8 @@ def _pairs(bases: list[Basis], variance_kept: float, length_scale: float) -> tup
     rank = int(np.searchsorted(np.cumsum(variance[order]), variance_kept)) + 1
     if rank > RANK_MAX:
         raise InputError.of(
-            f"mapping.length_scale_m of {length_scale:g} m is too short for the size of the survey area (it needs {rank} "
-            f"basis functions, at most {RANK_MAX} are possible): give a longer length_scale_m or a smaller area"
+            f"mapping.length_scale_m of {length_scale:g} m is too short for the size of the survey area (it needs "
+            f"{rank} basis functions, at most {RANK_MAX} are possible): give a longer length_scale_m or a smaller area"
         )
     i, j = np.unravel_index(order[:rank], (x.size, y.size))
     return i, j

@@ -62,8 +62,8 @@ def drive_tick(
         vehicle, progress = carry
         speed, yaw_rate, progress = guide(vehicle, progress)
         command = wheel_speeds(params, jnp.where(moving, speed, 0.0), jnp.where(moving, yaw_rate, 0.0), vehicle)
-        for _substep in range(substeps):
-            vehicle = step(params, vehicle, command, site)
+        # a loop and not unrolled: the contact solver takes long to compile
+        vehicle = jax.lax.fori_loop(0, substeps, lambda _, moved: step(params, moved, command, site), vehicle)
         return (vehicle, progress), None
 
     vehicle, progress = jax.lax.scan(control_period, (drive.vehicle, drive.progress_m), None, length=periods)[0]

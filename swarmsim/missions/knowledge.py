@@ -1,5 +1,7 @@
 """From one mission's measurements to what it knows: map, hotspots, estimates, the nuclide."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 
@@ -45,22 +47,35 @@ class GroundKnowledge:
     fit: SourceFit
 
 
-def count_from_air(key: jax.Array, world: World, log: Log) -> Measurements:
-    """The UAVs' measurements (axes [U, n]) along their logs [T, U]."""
+def count_from_air(key: jax.Array, world: World, log: Log, first: jax.Array | int = 0) -> Measurements:
+    """The UAVs' measurements (axes [U, n]) along their logs [T, U], which begin with sample number ``first``."""
     counts = keys.consumer(key, "aerial counts")
     each = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), log)
 
     def one(index: jax.Array, detector: Detector, log: Log) -> Measurements:
-        return count(jax.random.fold_in(counts, index), world.site, detector, world.sources, log, 1, AERIAL)
+        return count(jax.random.fold_in(counts, index), world.site, detector, world.sources, log, 1, AERIAL, first)
 
     return jax.vmap(one)(jnp.arange(world.team.home_m.shape[0]), world.team.detector, each)
 
 
-def count_on_ground(key: jax.Array, world: World, log: Log, ticks_per_sample: int) -> Measurements:
-    """The rover's measurements [n] along its log [T]."""
+def count_on_ground(
+    key: jax.Array,
+    world: World,
+    log: Log,
+    ticks_per_sample: int,
+    first: jax.Array | int = 0,
+    live_s: float | None = None,
+) -> Measurements:
+    """The rover's measurements [n] along its log [T], which begins with sample number ``first``.
+
+    ``live_s`` replaces the detector's own sample period.
+    """
     assert world.rover is not None
     counts = keys.consumer(key, "ground counts")
-    return count(counts, world.site, world.rover.detector, world.sources, log, ticks_per_sample, GROUND)
+    detector = world.rover.detector
+    if live_s is not None:
+        detector = replace(detector, sample_period_s=jnp.float32(live_s))
+    return count(counts, world.site, detector, world.sources, log, ticks_per_sample, GROUND, first)
 
 
 def detectors(world: World) -> tuple[Detector, ...]:

@@ -43,7 +43,14 @@ def source_rate(site: Site, detector: Detector, sources: Source, position_m: jax
 
 
 def count(
-    key: jax.Array, site: Site, detector: Detector, sources: Source, log: Log, per_sample: int, index: int
+    key: jax.Array,
+    site: Site,
+    detector: Detector,
+    sources: Source,
+    log: Log,
+    per_sample: int,
+    index: int,
+    first: jax.Array | int = 0,
 ) -> Measurements:
     """Measurements of one vehicle along its log: one for every ``per_sample`` ticks.
 
@@ -56,6 +63,7 @@ def count(
         log: [T] ticks; T is a whole number of samples.
         per_sample: ticks in a sample.
         index: of the detector in the mission's pair (UAV, rover).
+        first: number of the log's first sample since the mission began.
     """
     centre, axis = crystal_pose(detector, log.position_m, log.quaternion)
 
@@ -64,7 +72,7 @@ def count(
 
     rates = jax.lax.map(lambda pose: rate(*pose), (centre, axis), batch_size=256)
     samples = rates.shape[0] // per_sample
-    numbers = jnp.arange(samples)
+    numbers = first + jnp.arange(samples)
 
     def draw(number: jax.Array, mean: jax.Array) -> Any:
         return draw_counts(detector, jax.random.fold_in(key, number), mean, detector.sample_period_s)

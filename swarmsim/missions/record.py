@@ -5,8 +5,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmsim.config.vehicles import Multirotor, SkidSteer
-
 Floats = NDArray[np.floating]
 
 
@@ -14,7 +12,7 @@ Floats = NDArray[np.floating]
 class Event:
     """Something that happened to a vehicle: ``kind`` is crash, collision, landed, battery_empty, non_finite …"""
 
-    time_s: float
+    time_s: float  # inf: by the end of the mission
     vehicle: str
     kind: str
     detail: str
@@ -29,34 +27,6 @@ class Shape:
     width_m: float  # of a wheel; 0 for a rotor
     box_centre_m: Floats  # [3]
     box_size_m: Floats  # [3] length, width, height
-
-
-def shape_of(spec: Multirotor | SkidSteer) -> Shape:
-    """The shape that a vehicle's specification describes; a multirotor's box is its hub, between rotors and feet."""
-    if isinstance(spec, Multirotor):
-        hubs = np.array([r.position_m for r in spec.rotors], float)
-        feet = np.array(spec.feet.positions_m, float)
-        side = 0.8 * float(np.linalg.norm(hubs[:, :2], axis=1).mean())
-        top, bottom = float(hubs[:, 2].mean()), float(feet[:, 2].mean())
-        height = max(0.4 * (top - bottom), 0.25 * side)
-        return Shape(
-            hubs_m=hubs,
-            radius_m=spec.rotor.radius_m,
-            width_m=0.0,
-            box_centre_m=np.array([0.0, 0.0, top - 0.5 * height]),
-            box_size_m=np.array([side, 0.7 * side, height]),
-        )
-    wheels = spec.wheels
-    x, y = 0.5 * wheels.wheel_base_m, 0.5 * wheels.track_m
-    # The origin is the chassis' centre, chassis_height_m above the ground; the axles are a wheel radius above it.
-    z = wheels.radius_m - spec.chassis_height_m
-    return Shape(
-        hubs_m=np.array([[x, y, z], [x, -y, z], [-x, y, z], [-x, -y, z]]),
-        radius_m=wheels.radius_m,
-        width_m=wheels.width_m,
-        box_centre_m=np.zeros(3),
-        box_size_m=np.array(spec.chassis_size_m, float),
-    )
 
 
 @dataclass(frozen=True)
@@ -132,7 +102,7 @@ class Spectrum:
     background: Floats  # [c] expected background counts in the same live time
     fit: Floats  # [c] fitted counts of the best nuclide plus background
     live_time_s: float
-    nuclide: str
+    nuclide: str  # "none" where no nuclide explains the counts
     confidence: float
     scores: dict[str, float]  # posterior of every candidate nuclide
     lines_kev: Floats = field(default_factory=lambda: np.zeros(0))  # [l] gamma lines of the named nuclide, for labels
@@ -151,7 +121,7 @@ class TrueSource:
 class Phase:
     """A phase of the mission and its simulated time span."""
 
-    name: str
+    name: str  # its first word is that of its samples' phase: aerial survey, ground search
     start_s: float
     end_s: float
 
@@ -174,6 +144,21 @@ class MissionRecord:
     route_m: Floats  # [r, 3] planned route of the rover
     events: tuple[Event, ...]
     finding: str  # one sentence: what the mission found
+
+    def span(self, phase: str) -> tuple[float, float] | None:
+        """Start and end (s) of the ``aerial`` or ``ground`` phase; None where the mission had none."""
+        return next(((p.start_s, p.end_s) for p in self.phases if p.name.split()[0] == phase), None)
+
+    @property
+    def end_s(self) -> float:
+        """When the last phase ended."""
+        return max(p.end_s for p in self.phases)
+
+    @property
+    def survey_end_s(self) -> float:
+        """When the aerial phase ended: what was learnt from the air is known from then on; 0 without such a phase."""
+        span = self.span("aerial")
+        return 0.0 if span is None else span[1]
 
     def finite(self) -> "MissionRecord":
         """The mission without rows that are not finite: what a vehicle lost to a numerical failure left behind."""

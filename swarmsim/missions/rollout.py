@@ -174,14 +174,16 @@ class Simulation:
                 break
         return state, jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *logs)
 
-    def stage(self, name: str, function: Any, axes: tuple[int | None, ...], size: int | None = None) -> Stage:
+    def stage(
+        self, name: str, function: Any, axes: tuple[Any, ...], size: int | None = None, out_axes: Any = 0
+    ) -> Stage:
         """The compiled batch form of a function of one mission: ``axes`` tells which arguments have the axis B.
 
         The compiled function is kept under its name for the life of the simulation.
         """
         if name not in self._stages:
-            batched = jax.vmap(function, in_axes=axes, axis_size=size)
-            self._stages[name] = Stage(batched, self.clock)
+            batched = jax.vmap(function, in_axes=axes, out_axes=out_axes, axis_size=size)
+            self._stages[name] = Stage(name, batched, self.clock)
         return self._stages[name]
 
 

@@ -31,6 +31,7 @@ def build(scenario: Scenario) -> Simulation:
 
     Raises `InputError` with everything that is wrong.
     """
+    keep_compiled()
     site_model = load_site(scenario.site_file, tuple(scenario.materials))
     raise_if_any(check_geometry(scenario, site_model))
     return Simulation(scenario, site_model)
@@ -44,7 +45,6 @@ def run(
     Raises `InputError` for a scenario that cannot be flown, and where ``out`` exists and ``force`` is not given.
     """
     tell = progress or SilentProgress()
-    keep_compiled()
     tell.phase("load the site", 0.0)
     simulation = build(scenario)
     batch = simulation.rollout(range(scenario.mission.seed, scenario.mission.seed + missions), tell)

@@ -149,23 +149,47 @@ class Dynamics:
     def drive(self, world: World, path: Path, rover: Drive, ticks: jax.Array) -> tuple[Drive, Log]:
         """Drive the rover along its path for the ticks numbered ``ticks`` [T]; the log has the axis [T]."""
         assert world.rover is not None
-        assert self.drive_step is not None
-        params, timing = world.rover.params, self.timing
-        period = timing.dt_s * timing.substeps
+        params, period = world.rover.params, self.timing.dt_s * self.timing.substeps
 
         def guide(vehicle: SkidSteerState, progress: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-            target, limit, progress = driving.carrot(path, params.lookahead_m, progress, vehicle.body.position_m, period)
-            speed, yaw_rate = pursue(params, vehicle, target, limit)
-            return speed, yaw_rate, progress
+            position = vehicle.body.position_m
+            target, limit, progress = driving.carrot(path, params.lookahead_m, progress, position, period)
+            return *pursue(params, vehicle, target, limit), progress
+
+        return self._drive_guided(world, rover, ticks, self.timing.rover_periods, guide, path.length_m, path.points_m[-1])
+
+    def steer_rover(
+        self, world: World, rover: Drive, ticks: jax.Array, speed_m_s: jax.Array, yaw_rate_rad_s: jax.Array
+    ) -> tuple[Drive, Log]:
+        """Drive the rover at a speed and a yaw rate instead of along a path, in ticks of the UAVs."""
+        nowhere = jnp.full(3, jnp.inf)
+        return self._drive_guided(
+            world, rover, ticks, self.timing.uav_periods,
+            lambda vehicle, progress: (speed_m_s, yaw_rate_rad_s, progress), jnp.inf, nowhere,
+        )  # fmt: skip
+
+    def _drive_guided(
+        self,
+        world: World,
+        rover: Drive,
+        ticks: jax.Array,
+        periods: int,
+        guide: driving.Guide,
+        length_m: jax.Array | float,
+        end_m: jax.Array,
+    ) -> tuple[Drive, Log]:
+        assert world.rover is not None
+        assert self.drive_step is not None
+        params, timing, step = world.rover.params, self.timing, self.drive_step
+        tick_s = timing.dt_s * timing.substeps * periods
 
         def tick(rover: Drive, number: jax.Array) -> tuple[Drive, Log]:
-            now = rover.start_s + (number + 1) * timing.rover_tick_s
+            now = rover.start_s + (number + 1) * tick_s
             moved = driving.drive_tick(
-                params, rover, guide, world.site,
-                step=self.drive_step, periods=timing.rover_periods, substeps=timing.substeps, dt=timing.dt_s,
-            )  # fmt: skip
-            remaining = path.length_m - moved.progress_m
-            rover = driving.judge(params, rover, moved, path.points_m[-1], remaining, world.site, now)
+                params, rover, guide, world.site, step=step, periods=periods, substeps=timing.substeps, dt=timing.dt_s
+            )
+            remaining = length_m - moved.progress_m
+            rover = driving.judge(params, rover, moved, end_m, remaining, world.site, now)
             return rover, _log(rover.vehicle, rover.event_time_s, now)
 
         return jax.lax.scan(tick, rover, ticks)

@@ -8,21 +8,32 @@ import jax
 
 
 class Clock:
-    """Seconds spent compiling and running since it was last reset."""
+    """Seconds spent compiling and running each stage since the last reset."""
 
     def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
         """Begin again at zero."""
-        self.compile_s = 0.0
-        self.run_s = 0.0
+        self.compiled: dict[str, float] = {}
+        self.ran: dict[str, float] = {}
+
+    @property
+    def compile_s(self) -> float:
+        """Seconds spent compiling."""
+        return sum(self.compiled.values())
+
+    @property
+    def run_s(self) -> float:
+        """Seconds spent running."""
+        return sum(self.ran.values())
 
 
 class Stage:
     """A function compiled for each shape of its arguments that it meets; runs to completion at each call."""
 
-    def __init__(self, function: Callable[..., Any], clock: Clock):
+    def __init__(self, name: str, function: Callable[..., Any], clock: Clock):
+        self._name = name
         self._jitted = jax.jit(function)
         self._compiled: dict[Any, Any] = {}
         self._clock = clock
@@ -35,8 +46,8 @@ class Stage:
         if compiled is None:
             start = time.perf_counter()
             compiled = self._compiled[key] = self._jitted.lower(*arguments).compile()
-            self._clock.compile_s += time.perf_counter() - start
+            self._clock.compiled[self._name] = self._clock.compiled.get(self._name, 0.0) + time.perf_counter() - start
         start = time.perf_counter()
         result = jax.block_until_ready(compiled(*arguments))
-        self._clock.run_s += time.perf_counter() - start
+        self._clock.ran[self._name] = self._clock.ran.get(self._name, 0.0) + time.perf_counter() - start
         return result

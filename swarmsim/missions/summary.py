@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmsim.missions.record import Estimate, MissionRecord, TrueSource, VehicleRecord
+from swarmsim.missions.record import Estimate, Event, MissionRecord, Spectrum, TrueSource, VehicleRecord
 
 _PACKAGES = ("swarmsim", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "rerun-sdk")
 _ESTIMATE_KEYS = (
@@ -56,7 +56,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "aerial_estimate": estimate_summary(record.aerial_estimate, record.sources),
         "source": estimate_summary(record.estimate, record.sources),
         "nuclide": {
-            "name": None if spectrum is None else spectrum.nuclide,
+            "name": named(spectrum),
             "confidence": None if spectrum is None else float(spectrum.confidence),
         },
         "true_sources": [
@@ -67,28 +67,31 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
             {"name": v.name, "type": v.type, "crashed": bool(v.crashed), "energy_wh": energy_wh(v)}
             for v in record.vehicles
         ],
-        "events": [
-            {"time_s": float(e.time_s), "vehicle": e.vehicle, "kind": e.kind, "detail": e.detail} for e in record.events
-        ],
+        "events": [event_summary(e) for e in record.events],
         "real_time_factor": real_time_factor([record], timings),
         "timing": timing_summary(timings),
         "versions": versions(),
     }
 
 
+def event_summary(event: Event) -> dict[str, Any]:
+    """An event as plain JSON values; no time where it has none of its own."""
+    time_s = float(event.time_s) if np.isfinite(event.time_s) else None
+    return {"time_s": time_s, "vehicle": event.vehicle, "kind": event.kind, "detail": event.detail}
+
+
 def phase_summary(record: MissionRecord, phase: str) -> dict[str, Any]:
     """How long a phase took, how far its vehicles went together (m), and what they counted; zeros where not flown."""
-    spans = [p for p in record.phases if p.name == phase]
+    start, end = record.span(phase) or (0.0, 0.0)
     length = 0.0
-    for span in spans:
-        for vehicle in record.vehicles:
-            if vehicle.kind == _KIND_OF_PHASE[phase]:
-                inside = (vehicle.time_s >= span.start_s) & (vehicle.time_s <= span.end_s)
-                track = np.asarray(vehicle.position_m[inside], float)
-                length += float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
+    for vehicle in record.vehicles:
+        if vehicle.kind == _KIND_OF_PHASE[phase]:
+            inside = (vehicle.time_s >= start) & (vehicle.time_s <= end)
+            track = np.asarray(vehicle.position_m[inside], float)
+            length += float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
     rates = record.samples.of_phase(phase).count_rate_cps
     return {
-        "duration_s": float(sum(p.end_s - p.start_s for p in spans)),
+        "duration_s": float(end - start),
         "path_length_m": length,
         "measurements": len(rates),
         "count_rate_min_cps": float(rates.min()) if len(rates) else None,
@@ -139,6 +142,11 @@ def energy_wh(vehicle: VehicleRecord) -> float:
     return float(vehicle.energy_wh[-1]) if len(vehicle.energy_wh) else 0.0
 
 
+def named(spectrum: Spectrum | None) -> str | None:
+    """The nuclide that a spectrum names, if it names one."""
+    return None if spectrum is None or spectrum.nuclide == "none" else spectrum.nuclide
+
+
 def _plain(values: NDArray[np.floating]) -> list[float]:
     return [float(v) for v in values]
 
@@ -180,7 +188,7 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
         row |= _axes(name, values.pop("position_m"), ("east_m", "north_m", "up_m"))
         row |= _axes(name, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
         row |= {f"{name}_{key}": value for key, value in values.items()}
-    row["nuclide"] = None if record.spectrum is None else record.spectrum.nuclide
+    row["nuclide"] = named(record.spectrum)
     row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
     row["crashed"] = sum(bool(v.crashed) for v in record.vehicles)
     row["energy_wh"] = sum(energy_wh(v) for v in record.vehicles)

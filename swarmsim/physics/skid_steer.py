@@ -1,4 +1,4 @@
-"""How a skid-steer rover moves: one step of the engine that a scenario names, on the terrain and between the walls of a site."""
+"""How a skid-steer rover moves: one step of either engine on a site's terrain and between its walls."""
 
 from collections.abc import Callable
 from typing import Literal
@@ -10,7 +10,8 @@ from swarmsim.config.vehicles import SkidSteer
 from swarmsim.physics import rotations, wheel_contact, wheels
 from swarmsim.physics.skid_steer_analytic import analytic_step
 from swarmsim.site import Site, sample_with_gradient
-from swarmsim.vehicles.skid_steer import RoverBody, SkidSteerParams, rover_body
+from swarmsim.vehicles.rover_body import RoverBody, rover_body
+from swarmsim.vehicles.skid_steer import SkidSteerParams
 from swarmsim.vehicles.state import RigidState, SkidSteerState
 
 NEWTON_ITERATIONS = 4
@@ -24,8 +25,8 @@ def make_skid_steer_step(
 ) -> Step:
     """Step function ``(params, state, wheel_command_rad_s [4], site) -> state`` of ``engine``, ``dt`` seconds long.
 
-    ``mjx`` solves MuJoCo's contact problem under each wheel; ``analytic`` follows the terrain in closed form. Terrain is
-    ``site.terrain_m``; walls are where ``site.clearance_m`` is negative. Raises ValueError for an unknown engine.
+    ``mjx`` solves MuJoCo's contact problem under each wheel; ``analytic`` follows the terrain in closed form. Terrain
+    is ``site.terrain_m``; walls are where ``site.clearance_m`` is negative. Raises ValueError for an unknown engine.
     """
     if engine == "mjx":
         problem = wheel_contact.contact_problem(

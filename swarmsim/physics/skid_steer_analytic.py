@@ -1,8 +1,8 @@
 """Closed form of a skid-steer rover that follows the terrain, for the largest sweeps: no contact solver.
 
 Three motions are stepped apart, each with its Coulomb friction taken implicitly, so that it is stable at any step and
-comes to a true rest: along the wheels (traction up to friction x load, rolling resistance), turning (effective track and
-turning resistance of `swarmsim.vehicles.skid_steer`), and sideways (slides when pushed harder than friction holds).
+comes to a true rest: along the wheels (traction up to friction x load, rolling resistance), turning (effective track
+and turning resistance of `swarmsim.vehicles.skid_steer`), and sideways (slides when pushed harder than friction holds).
 Height and attitude are those of the plane through the ground below the four wheels.
 """
 
@@ -100,7 +100,10 @@ def _turn(
     lever = 0.5 * effective_track(params.wheel_position_m)
     inertia = _wheels_mass(params) + params.inertia_kg_m2[2, 2] / (lever * lever)
     radius = _rolling_radius(params)
-    force = jnp.sum(side * torque) / radius + moment / lever
+    rolling = (
+        0.25 * load * params.rolling_resistance * jnp.sum(side * jnp.tanh(wheel_speed / wheels.ROLLING_ONSET_RAD_S))
+    )
+    force = jnp.sum(side * torque) / radius + moment / lever - rolling
     free = 0.25 * jnp.sum(side * wheel_speed) * radius + dt * force / inertia
     base, track = wheel_spacing(params.wheel_position_m)
     # Slip of a tyre over the tread's speed while turning: half the diagonal times b / B, and the yaw rate.

@@ -17,11 +17,11 @@ import mujoco
 from mujoco import mjx
 
 from swarmsim.config.vehicles import SkidSteer
+from swarmsim.vehicles.rover_body import RoverBody
 from swarmsim.vehicles.skid_steer import (
     FRICTION_RATIO,
     IMPEDANCE,
     SLIP_DAMPING_1_S,
-    RoverBody,
     SkidSteerParams,
     skid_steer_mjcf,
     tyre_constants,
@@ -67,21 +67,20 @@ def mass_matrix(params: SkidSteerParams) -> jax.Array:
 def smooth_force(
     params: SkidSteerParams, twist: jax.Array, force: jax.Array, moment: jax.Array, wheel_torque: jax.Array
 ) -> jax.Array:
-    """Generalised force [10] less the gyroscopic one; ``force`` and ``moment`` [3] in the body frame, gravity included."""
+    """Generalised force [10] less the gyroscopic one; ``force``, ``moment`` [3] in the body frame, with gravity."""
     spin = twist[3:6]
-    momentum = params.inertia_kg_m2 @ spin + params.wheel_inertia_kg_m2 * jnp.sum(twist[6:]) * jnp.array(
-        [0.0, 1.0, 0.0]
-    )
+    wheels = params.wheel_inertia_kg_m2 * jnp.sum(twist[6:]) * jnp.array([0.0, 1.0, 0.0])
+    momentum = params.inertia_kg_m2 @ spin + wheels
     return jnp.concatenate([force, moment - jnp.cross(spin, momentum), wheel_torque])
 
 
 def contact_rows(
     problem: ContactProblem, params: SkidSteerParams, twist: jax.Array, distance: jax.Array, normal: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Jacobian [4, 3, 10], inverse softness [3] and reference acceleration [4, 3] along normal, rolling and side direction.
+    """Jacobian [4, 3, 10], inverse softness [3], reference acceleration [4, 3] along normal, rolling, side direction.
 
-    ``twist`` [10] is the velocity, ``distance`` [4] (m) that of each tyre from its plane, negative in it, ``normal`` [4, 3]
-    the planes' normals in the body frame. Formulas: MuJoCo documentation, "Computation", constraint model.
+    ``twist`` [10] is the velocity, ``distance`` [4] (m) that of each tyre from its plane, negative in it, ``normal``
+    [4, 3] the planes' normals in the body frame. Formulas: MuJoCo documentation, "Computation", constraint model.
     """
     reach = params.wheel_radius_m + 0.5 * distance
     arm = params.wheel_position_m - normal * reach[:, None]

@@ -52,8 +52,8 @@ def wall_contact(
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Where the outline's corners stand towards walls.
 
-    Returns the depth [4] (m, > 0 in the wall), the way out of the wall [4, 2] (unit, world), the speed into the wall [4]
-    (m/s) and the corners' arms from the centre of mass [4, 2] (m, world). ``rotation`` [3, 3]: body to world.
+    Returns the depth [4] (m, > 0 in the wall), the way out of the wall [4, 2] (unit, world), the speed into the wall
+    [4] (m/s) and the corners' arms from the centre of mass [4, 2] (m, world). ``rotation`` [3, 3]: body to world.
     """
     arm = params.corner_m @ rotation[:2, :2].T
     clearance, gradient = sample_with_gradient(site.clearance_m, site, state.body.position_m[:2] + arm)
@@ -87,13 +87,13 @@ def impact_speed(params: SkidSteerParams, state: SkidSteerState, site: Site) -> 
 
 
 def stand_on(slope: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Quaternion [4] of a body on ground of ``slope`` [2] (rise per metre along x, y) heading ``yaw`` [] seen from above."""
+    """Quaternion [4] of a body on ground of ``slope`` [2] (rise per metre along x, y), heading ``yaw`` [] (rad)."""
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return attitude(slope[0] * c + slope[1] * s, slope[1] * c - slope[0] * s, yaw)
 
 
 def attitude(climb: jax.Array, bank: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Quaternion [4] of a body on ground that rises by ``climb`` [] per metre ahead and ``bank`` [] per metre to the left."""
+    """Quaternion [4] of a body on ground that rises by ``climb`` [] per metre ahead and ``bank`` [] to the left."""
     pitch = -jnp.arctan(climb)
     roll = jnp.arctan(bank * jnp.cos(pitch))
     half = 0.5 * jnp.stack([yaw, pitch, roll])

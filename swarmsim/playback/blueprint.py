@@ -71,7 +71,7 @@ def _scene(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spat
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=centre + across * np.array([-0.10, -0.64, 0.47]),
+            position=centre + across * np.array([-0.09, -0.57, 0.42]),
             look_target=centre + across * np.array([0.0, -0.08, 0.0]),
             eye_up=[0.0, 0.0, 1.0],
         ),
@@ -99,8 +99,7 @@ def _map(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatia
 
 def _plots(record: MissionRecord) -> rrb.Container:
     """Count rates and batteries against the time of the phase that they belong to."""
-    spans = {p.name: (p.start_s, p.end_s) for p in record.phases if p.end_s > p.start_s}
-    whole = (min(p.start_s for p in record.phases), max(p.end_s for p in record.phases))
+    whole = (min(p.start_s for p in record.phases), record.end_s)
 
     def plot(origin: str, name: str, span: tuple[float, float]) -> rrb.TimeSeriesView:
         start, end = (rrb.TimeRangeBoundary.absolute(seconds=s) for s in span)
@@ -112,8 +111,8 @@ def _plots(record: MissionRecord) -> rrb.Container:
         )
 
     return rrb.Horizontal(
-        plot("plots/aerial_rate", "Count rate, air [1/s]", spans.get("aerial", whole)),
-        plot("plots/ground_rate", "Count rate, ground [1/s]", spans.get("ground", whole)),
+        plot("plots/aerial_rate", "Count rate, air [1/s]", record.span("aerial") or whole),
+        plot("plots/ground_rate", "Count rate, ground [1/s]", record.span("ground") or whole),
         rrb.Tabs(plot("plots/battery", "Battery [%]", whole), plot("plots/height", "Height above ground [m]", whole)),
     )
 

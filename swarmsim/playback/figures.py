@@ -48,7 +48,9 @@ def trajectories(record: MissionRecord, site_model: SiteModel) -> Figure:
         x, y, _ = vehicle.position_m[:: max(1, len(vehicle.time_s) // _TRACK_POINTS_MAX)].T
         line = "-" if vehicle.kind == "multirotor" else "--"
         axes.plot(x, y, line, color=colour, label=vehicle.name, zorder=4)
-        axes.plot(x[:1], y[:1], "s", color=colour, markersize=3.0, markeredgecolor="black", markeredgewidth=0.4, zorder=6)
+        axes.plot(
+            x[:1], y[:1], "s", color=colour, markersize=3.0, markeredgecolor="black", markeredgewidth=0.4, zorder=6
+        )
     plan.draw_truth(axes, record)
     handles, _ = axes.get_legend_handles_labels()
     start = Line2D(
@@ -88,7 +90,7 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
         plan.draw_estimate(axes, record.aerial_estimate, "estimate from the air, 95 % ellipse")
     plan.colour_bar(figure, close, image, "Count rate, interpolated [1/s]")
     handles, _ = whole.get_legend_handles_labels()
-    plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="buildings, trees")])
+    plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="obstacles")])
     return figure
 
 

@@ -96,7 +96,7 @@ def snapshots(record: MissionRecord, count: int) -> list[Snapshot]:
     if len(aerial.time_s) == 0:
         return []
     grid = grid_of(record.map)
-    end = next((p.end_s for p in record.phases if p.name == "aerial"), float(aerial.time_s[-1]))
+    end = record.survey_end_s or float(aerial.time_s[-1])
     made = []
     for time in np.linspace(0.0, end, count + 2)[1:-1]:
         so_far = aerial.until(time)

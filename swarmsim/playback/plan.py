@@ -125,14 +125,15 @@ def draw_site(axes: Axes, site_model: SiteModel) -> None:
         ha="center",
         va="center",
         fontsize=7.5,
+        bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
         arrowprops={"arrowstyle": "-|>", "color": "black", "linewidth": 0.8, "shrinkA": 1, "shrinkB": 0},
         zorder=9,
     )
 
 
 def building_patch() -> Patch:
-    """Legend entry of the grey shapes."""
-    return Patch(facecolor="0.7", edgecolor="none", label="buildings, trees")
+    """Legend entry of the grey shapes: buildings, trees, walls."""
+    return Patch(facecolor="0.7", edgecolor="none", label="obstacles")
 
 
 def note(axes: Axes, text: str) -> None:

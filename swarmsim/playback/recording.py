@@ -254,7 +254,7 @@ def _send_spectrum(stream: rr.RecordingStream, record: MissionRecord) -> None:
         note = rr.TextDocument("No spectrum: nothing was found to identify.", media_type="text/markdown")
         stream.log("spectrum", note, static=True)
         return
-    stream.set_time(TIMELINE, duration=float(record.phases[-1].end_s))
+    stream.set_time(TIMELINE, duration=float(record.end_s))
     merge = max(1, len(spectrum.counts) // SPECTRUM_BARS)
     kept = len(spectrum.counts) // merge * merge
     energy, counts, fit = (v[:kept].reshape(-1, merge) for v in (spectrum.energy_kev, spectrum.counts, spectrum.fit))

@@ -21,12 +21,11 @@ def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: 
     for k, source in enumerate(record.sources):
         label = f"true {source.nuclide}, {source.activity_mbq:.0f} MBq"
         _pin(stream, f"truth/{k}", source.position_m, 7.0, label, TRUTH, static=True)
-    survey_end = next((p.end_s for p in record.phases if p.name == "aerial"), 0.0)
-    stream.set_time(TIMELINE, duration=float(survey_end))
+    stream.set_time(TIMELINE, duration=float(record.survey_end_s))
     _hotspots_and_route(stream, record, site_model)
     if record.aerial_estimate is not None:
         _estimate(stream, "estimate/aerial", record.aerial_estimate, "from the air", _AERIAL_ESTIMATE)
-    stream.set_time(TIMELINE, duration=float(record.phases[-1].end_s))
+    stream.set_time(TIMELINE, duration=float(record.end_s))
     if record.estimate is not None:
         _estimate(stream, "estimate/final", record.estimate, "final", ESTIMATE)
         # The first guess has served; two pins a metre apart only hide each other.

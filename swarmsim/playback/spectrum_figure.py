@@ -26,16 +26,14 @@ def spectrum_figure(spectrum: Spectrum | None) -> Figure:
     measured = f"measured, {spectrum.live_time_s:.0f} s live"
     upper.step(energy, counts, where="mid", color="0.35", linewidth=0.7, label=measured)
     upper.fill_between(energy, background, 0.1, step="mid", color="0.88", label="expected background")
-    upper.plot(energy, fit, color=ESTIMATE, linewidth=1.0, label=f"{spectrum.nuclide} + background")
+    upper.plot(energy, fit, color=ESTIMATE, linewidth=1.0, label="fit")
     upper.set_yscale("log")
     # Room above for the labels of the lines; a mean of less than half a count in a bin says little.
     upper.set_ylim(max(0.5, 0.5 * float(fit.min())), 60.0 * max(float(counts.max()), float(fit.max()), 1.0))
     upper.set_ylabel(f"Counts per {energy[1] - energy[0]:.1f} keV")
     upper.tick_params(labelbottom=False)
     _label_lines(upper, spectrum, energy, fit)
-    upper.legend(
-        loc="upper right", title=f"{spectrum.nuclide}, confidence {confidence_text(spectrum)}", title_fontsize=7.5
-    )
+    upper.legend(loc="upper right", title=spectrum_title(spectrum), title_fontsize=7.5)
     residual = (counts - fit) / np.sqrt(np.maximum(fit, 1.0))
     lower.axhline(0.0, color=ESTIMATE, linewidth=0.8)
     lower.plot(energy, residual, ".", color="0.35", markersize=1.6)
@@ -48,9 +46,12 @@ def spectrum_figure(spectrum: Spectrum | None) -> Figure:
     return figure
 
 
-def confidence_text(spectrum: Spectrum) -> str:
-    """The confidence to three digits, never rounded up to certainty."""
-    return "> 0.999" if spectrum.confidence > 0.999 else f"{spectrum.confidence:.3f}"
+def spectrum_title(spectrum: Spectrum) -> str:
+    """What the spectrum names, with its confidence to three digits, never rounded up to certainty."""
+    if spectrum.nuclide == "none":
+        return "no nuclide named"
+    confidence = "> 0.999" if spectrum.confidence > 0.999 else f"{spectrum.confidence:.3f}"
+    return f"{spectrum.nuclide}, confidence {confidence}"
 
 
 def _merged(values: NDArray[np.floating], merge: int) -> NDArray[np.floating]:

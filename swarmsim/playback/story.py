@@ -5,24 +5,24 @@ import rerun as rr
 
 from swarmsim.missions.record import Estimate, MissionRecord
 from swarmsim.playback.blueprint import BODY_SCALE, TIMELINE
-from swarmsim.playback.spectrum_figure import confidence_text
+from swarmsim.playback.spectrum_figure import spectrum_title
 
-_LEVEL = {"crash": "ERROR", "collision": "ERROR", "non_finite": "ERROR", "battery_empty": "WARN"}
+_LEVEL = {"crash": "ERROR", "collision": "ERROR", "non_finite": "ERROR", "battery_empty": "WARN", "time_limit": "WARN"}
 
 
 def story(record: MissionRecord) -> list[tuple[float, str, str]]:
     """Lines of the log in time order: simulated time (s), level, text."""
     lines = []
     for phase in record.phases:
-        lines.append((phase.start_s, "INFO", f"{phase.name} phase begins"))
-        lines.append((phase.end_s, "INFO", f"{phase.name} phase ends after {phase.end_s - phase.start_s:.0f} s"))
+        lines.append((phase.start_s, "INFO", f"{phase.name} begins"))
+        lines.append((phase.end_s, "INFO", f"{phase.name} ends after {phase.end_s - phase.start_s:.0f} s"))
+    end = record.end_s
     for event in record.events:
         text = f"{event.vehicle}: {event.kind.replace('_', ' ')}" + (f" ({event.detail})" if event.detail else "")
-        lines.append((event.time_s, _LEVEL.get(event.kind, "INFO"), text))
-    survey_end = next((p.end_s for p in record.phases if p.name == "aerial"), 0.0)
+        lines.append((min(event.time_s, end), _LEVEL.get(event.kind, "INFO"), text))
+    survey_end = record.survey_end_s
     for x, y in record.map.hotspots_m:
         lines.append((survey_end, "INFO", f"hotspot at {x:.1f} m east, {y:.1f} m north"))
-    end = max(p.end_s for p in record.phases)
     for when, name, estimate in (
         (survey_end, "estimate from the air", record.aerial_estimate),
         (end, "final estimate", record.estimate),
@@ -30,7 +30,7 @@ def story(record: MissionRecord) -> list[tuple[float, str, str]]:
         if estimate is not None:
             lines.append((when, "INFO", f"{name}: {describe(estimate)}"))
     if record.spectrum is not None:
-        named = f"{record.spectrum.nuclide} with confidence {confidence_text(record.spectrum)}"
+        named = spectrum_title(record.spectrum)
         lines.append((end, "INFO", f"spectrum of {record.spectrum.live_time_s:.0f} s live: {named}"))
     lines.append((end, "INFO", record.finding))
     return sorted(lines, key=lambda line: line[0])
@@ -58,7 +58,8 @@ def send_log(stream: rr.RecordingStream, record: MissionRecord) -> None:
 def page(record: MissionRecord) -> str:
     """The mission on one page, in Markdown."""
     team = "\n".join(
-        f"| {v.name} | {v.type} | {v.energy_wh[-1] if len(v.energy_wh) else 0.0:.1f} | {'crashed' if v.crashed else 'ok'} |"
+        f"| {v.name} | {v.type} | {v.energy_wh[-1] if len(v.energy_wh) else 0.0:.1f} | "
+        f"{'crashed' if v.crashed else 'ok'} |"
         for v in record.vehicles
     )
     truth = "\n".join(

@@ -22,19 +22,37 @@ def solid_angle_per_area(
 ) -> jax.Array:
     """Solid-angle fraction of the crystal over its silhouette [1/m2], at ``distance_m`` from the crystal's centre.
 
-    The silhouette A is a disc of radius sqrt(A / pi) at a distance h; the fraction (1 - h / S) / 2 with
-    S^2 = h^2 + A / pi is written A / (2 pi S (S + h)), which does not cancel in float32. h runs from 0 at the
-    crystal's surface (half of all photons) to the distance of the silhouette's mean depth: end-on that is the front
-    face (exact at any distance), side-on the plane of the axis, so that h^2 = d^2 - a^2. Inside the crystal h is 0.
+    The end face and the side count apart, each as a disc of its own area seen under its own angle (`_disc_fraction`).
+    On the axis that is the exact solid angle of the face at any distance, a half in contact and inside the crystal.
+    The face is seen under the height h above it and the part of the offset that leads beyond its rim; the side as the
+    rectangle between its tangents, pi/8 of a radius in front of the axis (where the curved rims of a side-on crystal
+    lie on average), first from its own height and further off from its middle. Within 7 % of the true solid angle
+    from 6 cm on at any angle, 3 % from 1 m on (2 inch crystal), and exact far away: silhouette / (4 pi r^2).
     """
-    area = projected_area(radius_m, length_m, u, s)
-    nearer = 0.5 * jnp.pi * radius_m**2 * length_m * u * u / area
-    surface = jnp.minimum(0.5 * length_m / jnp.maximum(u, 1e-9), radius_m / jnp.maximum(s, 1e-9))
-    squared = (distance_m - surface) * (distance_m + surface - 2.0 * nearer)
-    outside = (distance_m > surface) & (squared > 1e-12)
-    h = jnp.where(outside, jnp.sqrt(jnp.where(outside, squared, 1.0)), 0.0)
-    to_rim = jnp.sqrt(h * h + area / jnp.pi)
-    return 1.0 / (2.0 * jnp.pi * to_rim * (to_rim + h))
+    offset, height = distance_m * s, distance_m * u
+    above = jnp.maximum(height - 0.5 * length_m, 0.0)
+    beyond = offset * offset - radius_m * radius_m  # tangent length squared
+    outside = beyond > 1e-12
+    tangent2 = jnp.where(outside, beyond, 0.0)
+    tangent = jnp.where(outside, jnp.sqrt(jnp.where(outside, beyond, 1.0)), 0.0)
+    face_area = jnp.pi * radius_m**2
+    within = jnp.minimum(offset, radius_m) ** 2 * above**2 / (above**2 + radius_m**2)
+    face = _disc_fraction(face_area, above, tangent2 + within)
+    ahead = jnp.where(outside, tangent2 / (offset + jnp.pi / 8 * radius_m), 1.0)  # 1: gradients stay finite
+    side_area = 2.0 * radius_m * length_m * tangent / jnp.maximum(offset, 1e-9)
+    middle = (height**2 - above**2) * ahead**2 / (ahead**2 + 0.075 * length_m**2)
+    side = jnp.where(outside, _disc_fraction(side_area, ahead, above**2 + middle), 0.0)
+    return jnp.minimum(face + side, 0.5) / projected_area(radius_m, length_m, u, s)
+
+
+def _disc_fraction(area: jax.Array, height: jax.Array, offset2: jax.Array) -> jax.Array:
+    """Solid-angle fraction of a disc at a height along its normal and an offset (squared) across it.
+
+    On the axis (1 - h / S) / 2 with S^2 = h^2 + a^2, written a^2 / (2 S (S + h)), which does not cancel in float32.
+    """
+    distance = jnp.sqrt(height**2 + offset2 + 1e-20)
+    to_rim = jnp.sqrt(distance**2 + area / jnp.pi)
+    return 0.5 * area / jnp.pi / (to_rim * (to_rim + distance)) * (height + 1e-6) / (distance + 1e-6)
 
 
 def direction_basis(u: jax.Array, s: jax.Array) -> jax.Array:

@@ -3,8 +3,8 @@
 The hypotheses: background alone; background and an unknown source of which only scattered photons are seen;
 background and one nuclide; background and two. Under each, the spectrum is a non-negative sum of templates: the
 background, two smooth continua for photons scattered anywhere, and for each nuclide its spectrum as emitted and as it
-leaves thick shielding, so that hardening on the way costs no likelihood. The sum is fitted by maximum Poisson likelihood
-(expectation maximisation; a template that starts at zero stays there, so that all hypotheses are one matrix).
+leaves thick shielding, so that hardening on the way costs no likelihood. The fit is of maximum Poisson likelihood
+(expectation maximisation; a template that starts at zero stays there, so all hypotheses are one matrix).
 Posterior = likelihood x Occam factor of the source's strength x prior, where each bin's deviance is lessened for the
 templates' own error.
 """
@@ -27,6 +27,7 @@ _RELAXATION = 1.6  # exponent of the multiplicative step; below 2 it still conve
 _PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO = 0.4, 0.1, 0.4, 0.1
 _TEMPLATE_ERROR = 0.04  # relative error of the templates in a bin: an estimate
 _STRENGTH_SCALE = 0.3  # of the background, of the half-Cauchy prior of a source's strength
+_COUNTS_FLOOR = 0.05  # per bin: keeps the information finite where hardly anything is expected
 _SMOOTH = 3  # templates shared by the hypotheses: background and the two continua
 
 
@@ -94,11 +95,12 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
     expected = jnp.maximum(weights @ shape, 1e-12)
     deviance = 2.0 * (expected - data + jax.scipy.special.xlogy(data, data / expected))  # [H, bins]
     certainty = 1.0 / (1.0 + _TEMPLATE_ERROR**2 * data)
+    precision = certainty / (expected + _COUNTS_FLOOR)
     source = slice(_SMOOTH, _SMOOTH + nuclides)
     strength = weights[:, source] + weights[:, _SMOOTH + nuclides :]  # [H, N] counts
     scale = _STRENGTH_SCALE * jnp.maximum(detector.background_cps, 1.0) * jnp.maximum(live_s, 1e-3)
-    occam = jnp.sum(members * _log_occam(strength, (certainty / expected) @ (shape[source] ** 2).T, scale), axis=1)
-    hidden = jnp.sum((certainty / expected[1]) * shape[1] ** 2)
+    occam = jnp.sum(members * _log_occam(strength, precision @ (shape[source] ** 2).T, scale), axis=1)
+    hidden = jnp.sum(precision[1] * shape[1] ** 2)
     occam = occam.at[1].set(_log_occam(weights[1, 1] + weights[1, 2], hidden, scale))
     posterior = jax.nn.softmax(log_prior + occam - 0.5 * deviance @ certainty)
     present, none, unknown = posterior @ members, posterior[0], posterior[1]
@@ -140,4 +142,4 @@ def _log_occam(strength: jax.Array, information: jax.Array, scale: jax.Array) ->
     """
     density = 2.0 / (jnp.pi * scale * (1.0 + (strength / scale) ** 2))
     width = jnp.sqrt(2.0 * jnp.pi / (information + (0.5 / scale) ** 2))
-    return jnp.log(density * width * ndtr(strength * jnp.sqrt(information)) + 1e-30)
+    return jnp.log(jnp.clip(density * width * ndtr(strength * jnp.sqrt(information)), 1e-30, 1.0))

@@ -14,7 +14,7 @@ Floats = NDArray[np.float64]
 REFERENCE_KEV = 661.66
 SIGMA_PER_FWHM = 1 / 2.354820045
 _STEP_KEV = 3.0  # of the grid on which continua are made before they are blurred
-# Shares of the continuum below a full-energy peak, estimates for a bare crystal of 1.5 to 2 inches on a light vehicle:
+# Shares of the continuum below a full-energy peak, estimates for a crystal of 1.5 to 2 inches on a light vehicle:
 _BACKSCATTER_SHARE = 0.08  # photons turned back by what surrounds the crystal
 _MULTIPLE_SHARE = 0.12  # several Compton events in the crystal, between the edge and the peak
 
@@ -98,7 +98,7 @@ def compton_edge_kev(energy_kev: Floats) -> Floats:
 def compton_recoil(energy_kev: float, recoil_kev: Floats) -> Floats:
     """Klein-Nishina distribution of the recoil energy [t], up to a factor; 0 beyond the Compton edge.
 
-    Knoll, Radiation Detection and Measurement, 4th ed., section 10.III, with s = T / E.
+    The Klein-Nishina law in terms of s = T / E instead of the angle (`swarmsim.radiation.build_up.klein_nishina`).
     """
     k = energy_kev / ELECTRON_KEV
     inside = (recoil_kev > 0) & (recoil_kev < compton_edge_kev(np.array(energy_kev)))
@@ -117,26 +117,18 @@ def _grid(response: Response) -> Floats:
     return np.arange(0.5 * _STEP_KEV, response.channel_edge_kev[-1] * 1.1, _STEP_KEV)
 
 
-def _continuum(energy_kev: float, grid: Floats) -> Floats:
+def _continuum(response: Response, energy_kev: float, grid: Floats) -> Floats:
     """Deposited energies below the full-energy peak [grid], sums to 1: Compton, multiple Compton, backscatter."""
     edge = float(compton_edge_kev(np.array(energy_kev)))
-    single = compton_recoil(energy_kev, grid)
-    multiple = ((grid > edge) & (grid < energy_kev)).astype(float)
+    above = grid >= response.threshold_kev
+    single = compton_recoil(energy_kev, grid) * above
+    multiple = ((grid > edge) & (grid < energy_kev)) * above
     back = energy_kev - edge
-    backscatter = np.exp(-0.5 * ((grid - 1.05 * back) / (0.08 * back)) ** 2) * (grid < energy_kev)
+    backscatter = np.exp(-0.5 * ((grid - 1.05 * back) / (0.08 * back)) ** 2) * (grid < energy_kev) * above
     single_share = 1 - _MULTIPLE_SHARE - _BACKSCATTER_SHARE
     parts = ((single, single_share), (multiple, _MULTIPLE_SHARE), (backscatter, _BACKSCATTER_SHARE))
     total = sum(share * shape / max(float(shape.sum()), 1e-12) for shape, share in parts)
-    return np.asarray(total / np.sum(total))
-
-
-def _unscattered(response: Response, energies: Floats, blur: Floats, grid: Floats) -> Floats:
-    """Spectra [e, channels] of photons of each energy that meet the crystal, each summing to 1."""
-    share = response.photopeak_share(energies)[:, None]
-    continuum = np.stack([_continuum(float(e), grid) for e in energies]) @ blur
-    continuum /= np.maximum(continuum.sum(axis=1, keepdims=True), 1e-12)
-    peak = _blur(response, energies)
-    return _normalised(share * peak + (1 - share) * continuum)
+    return np.asarray(total / max(float(np.sum(total)), 1e-12))
 
 
 def _normalised(spectra: Floats) -> Floats:
@@ -147,7 +139,9 @@ def peak_spectrum(response: Response, energy_kev: Floats) -> Floats:
     """Spectra [..., channels] of the lines ``energy_kev`` [...], unscattered on their way; each sums to 1."""
     grid = _grid(response)
     flat, back = np.unique(energy_kev, return_inverse=True)
-    spectra = _unscattered(response, flat, _blur(response, grid), grid)
+    share = response.photopeak_share(flat)[:, None]
+    continuum = np.stack([_continuum(response, float(e), grid) for e in flat]) @ _blur(response, grid)
+    spectra = _normalised(share * _blur(response, flat) + (1 - share) * continuum)
     return spectra[back].reshape(*energy_kev.shape, -1)
 
 
@@ -164,12 +158,14 @@ def scattered_flux(energy_kev: float, grid: Floats) -> Floats:
 def scattered_spectrum(response: Response, energy_kev: Floats) -> Floats:
     """Spectra [..., channels] of the scattered photons that lines ``energy_kev`` [...] arrive with; each sums to 1."""
     grid = _grid(response)
-    inside = (grid >= 30.0) & (grid <= response.crystal.energy_kev[-1])
-    seen = np.where(inside, response.end_on_efficiency(np.where(inside, grid, 100.0)), 0.0)
-    single = _unscattered(response, grid[inside], _blur(response, grid), grid)
+    inside = np.flatnonzero((grid >= response.threshold_kev) & (grid <= response.crystal.energy_kev[-1]))[::2]
+    photons = grid[inside]
+    share = response.photopeak_share(photons)
+    deposits = (1 - share)[:, None] * np.stack([_continuum(response, float(e), grid) for e in photons])
+    deposits[np.arange(len(inside)), inside] += share
     flat, back = np.unique(energy_kev, return_inverse=True)
-    flux = np.stack([scattered_flux(float(e), grid) * seen for e in flat])[:, inside]
-    return _normalised(flux @ single)[back].reshape(*energy_kev.shape, -1)
+    flux = np.stack([scattered_flux(float(e), photons) for e in flat]) * response.end_on_efficiency(photons)
+    return _normalised(flux @ deposits @ _blur(response, grid))[back].reshape(*energy_kev.shape, -1)
 
 
 def background_spectrum(response: Response, background: Background) -> Floats:

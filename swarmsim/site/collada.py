@@ -13,7 +13,7 @@ Colour = tuple[float, float, float]
 def write_collada(
     path: Path, parts: Mapping[tuple[str, str], NDArray[np.float64]], colours: Mapping[str, Colour]
 ) -> None:
-    """Write ``parts``, triangles [t, 3, 3] in m by (geometry, material), with the ``colours`` (0 to 1) of the materials."""
+    """Write ``parts``, triangles [t, 3, 3] in m by (geometry, material), with the materials' ``colours`` (0 to 1)."""
     used = sorted({material for _, material in parts})
     lines = [
         '<?xml version="1.0" encoding="utf-8"?>',
@@ -24,10 +24,7 @@ def write_collada(
         *(_effect(name, colours[name]) for name in used),
         "</library_effects>",
         "<library_materials>",
-        *(
-            f'<material id="{m}" name={quoteattr(m)}><instance_effect url="#{m}-effect"/></material>'
-            for m in used
-        ),
+        *(f'<material id="{m}" name={quoteattr(m)}><instance_effect url="#{m}-effect"/></material>' for m in used),
         "</library_materials>",
         "<library_geometries>",
         *(_geometry(f"g{i}", *key, triangles) for i, (key, triangles) in enumerate(parts.items())),

@@ -50,7 +50,7 @@ def clearance(
 
 
 def _pockets(blocked: Mask, cells: float) -> Mask:
-    """Free places smaller than ``cells`` that a rover cannot leave or reach, such as the inside of an open container."""
+    """Free places smaller than ``cells`` that a rover cannot leave or reach, such as an open container's inside."""
     place, count = ndimage.label(~blocked)
     return (np.bincount(place.ravel(), minlength=count + 1) < cells)[place] & ~blocked
 

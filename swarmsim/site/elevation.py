@@ -76,7 +76,9 @@ def _check_raster(file: Any, path: Path) -> None:
         )  # fmt: skip
     if file.crs and file.crs.is_geographic:
         raise InputError.of(
-            "is in degrees", file=path, suggestion="reproject it to metres, e.g. gdalwarp -t_srs EPSG:32632 IN.tif OUT.tif"
+            "is in degrees",
+            file=path,
+            suggestion="reproject it to metres, e.g. gdalwarp -t_srs EPSG:32632 IN.tif OUT.tif",
         )
     if matrix.b or matrix.d or matrix.e >= 0 or abs(matrix.a + matrix.e) > 1e-3 * matrix.a:
         raise InputError.of(

@@ -16,6 +16,7 @@ Mask = NDArray[np.bool_]
 SMOOTH_SLOPE = 1.2  # neighbouring cells steeper than this (50 deg) belong to different sheets
 RAISED_SHARE = 0.6  # a sheet with this share of its border above its neighbours stands on the ground
 SHEET_MAX = 0.2  # a sheet of more than this share of the site is ground whatever its border
+PIT_M2 = 4.0  # a lower sheet smaller than this is the foot of something sunk into the ground, such as a post
 THICKNESS = 0.1  # m; a surface this near to the ground is part of it
 
 
@@ -49,7 +50,7 @@ def found_ground(grid: Grid, corners: Floats) -> Floats:
 
 
 def _raised(height: Floats, cell: float) -> Mask:
-    """Cells [ny, nx] of the sheets that stand on others."""
+    """Cells [ny, nx] of the sheets that stand on others, or are the sunk feet of things."""
     index = np.arange(height.size).reshape(height.shape)
     pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
     one, other = (np.concatenate([p[i].ravel() for p in pairs]) for i in (0, 1))
@@ -64,7 +65,8 @@ def _raised(height: Floats, cell: float) -> Mask:
     higher = np.bincount(sheet[one], above, count) + np.bincount(sheet[other], ~above, count)
     area = np.bincount(sheet, np.isfinite(flat), count)
     stands = (higher > RAISED_SHARE * length) & (area <= SHEET_MAX * max(area.sum(), 1.0))
-    return (stands[sheet] & np.isfinite(flat)).reshape(height.shape)
+    sunk = (length - higher > RAISED_SHARE * length) & (area * cell**2 < PIT_M2)
+    return ((stands | sunk)[sheet] & np.isfinite(flat)).reshape(height.shape)
 
 
 def complete_ground(seen: Floats, covered: Mask, holes_max: float) -> Ground:
@@ -91,20 +93,21 @@ def complete_ground(seen: Floats, covered: Mask, holes_max: float) -> Ground:
             suggestion="close the holes in the mesh, choose larger cells (cell_m), or raise holes_max to have them "
             "filled by interpolation",
         )
-    return Ground(height=_interpolated(seen, missing), filled=holes, outside=outside)
+    return Ground(height=_interpolated(seen, missing, outside), filled=holes, outside=outside)
 
 
-def _interpolated(seen: Floats, missing: Mask) -> Floats:
+def _interpolated(seen: Floats, missing: Mask, outside: Mask) -> Floats:
     """Missing cells by linear interpolation between the cells around them; the nearest beyond the outline."""
     if not missing.any():
         return seen
     nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
     filled = seen[tuple(nearest)]
-    ring = ~missing & ndimage.binary_dilation(missing)
+    enclosed = missing & ~outside
+    ring = ~missing & ndimage.binary_dilation(enclosed)
     points = np.argwhere(ring)
     if len(points) and np.linalg.matrix_rank(points - points.mean(axis=0)) == 2:
         from scipy.interpolate import LinearNDInterpolator
 
-        value = LinearNDInterpolator(points, seen[ring])(np.argwhere(missing))
-        filled[missing] = np.where(np.isfinite(value), value, filled[missing])
+        value = LinearNDInterpolator(points, seen[ring])(np.argwhere(enclosed))
+        filled[enclosed] = np.where(np.isfinite(value), value, filled[enclosed])
     return filled

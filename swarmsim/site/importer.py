@@ -28,7 +28,6 @@ Mask = NDArray[np.bool_]
 CELLS_MAX = 4_000_000
 AIR = "air"  # the material of what is painted on other things and needs no box
 BOXES_MAX = 1024  # every ray meets every box: the largest are kept
-CORNER_THICKNESS = 0.3  # m; a triangle between the cells' centres this near to the ground is ground
 
 
 @dataclass(frozen=True)
@@ -160,7 +159,9 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
         )  # fmt: skip
     if not spec.extent_m[0] <= max(east, north) <= spec.extent_m[1]:
         small = max(east, north) < spec.extent_m[0]
-        units = "1.0 (metres) or 0.3048 (feet)" if small else "0.01 (centimetres), 0.0254 (inches) or 0.001 (millimetres)"
+        units = (
+            "1.0 (metres) or 0.3048 (feet)" if small else "0.01 (centimetres), 0.0254 (inches) or 0.001 (millimetres)"
+        )
         raise InputError.of(
             f"the site would be {'tiny' if small else 'huge'}: {shape}; the unit is probably wrong", file=path,
             path="unit_m", allowed=f"a longer side of {spec.extent_m[0]:g} to {spec.extent_m[1]:g} m (extent_m)",
@@ -215,7 +216,7 @@ def _near_ground(grid: Grid, seen: Floats, corners: Floats) -> Mask:
     away = np.bincount(hits.triangle, off, count)
     # A slope's height changes within a cell: corners may differ from its centre's by half a cell's rise.
     north, east = np.gradient(seen, grid.cell)
-    allowance = CORNER_THICKNESS + np.nan_to_num(np.hypot(north, east)).ravel() * grid.cell
+    allowance = THICKNESS + np.nan_to_num(np.hypot(north, east)).ravel() * grid.cell
     cell = grid.cell_of(corners[..., :2])
     near = np.abs(corners[..., 2] - flat[cell]) <= allowance[cell]
     return np.where(touched > 0, away <= 0.5 * touched, near.all(axis=1))

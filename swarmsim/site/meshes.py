@@ -1,5 +1,6 @@
 """Mesh files (COLLADA, OBJ, glTF binary, STL) as named, coloured parts in metres, z up."""
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,9 @@ def read_mesh(path: Path, spec: SiteSpec) -> list[Part]:
     except Exception as error:  # the readers raise whatever their XML, JSON and number parsers raise
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError.of(
-            f"cannot be read as {path.suffix.lower()} ({reason})", file=path, suggestion="export it anew from its program"
+            f"cannot be read as {path.suffix.lower()} ({reason})",
+            file=path,
+            suggestion="export it anew from its program",
         ) from error
     parts = [part for part in parts if len(part.triangles)]
     if not parts:
@@ -73,7 +76,13 @@ def _sound(part: Part) -> bool:
 def _read_collada(path: Path) -> tuple[float, str, list[Part]]:
     import collada
 
-    scene = collada.Collada(str(path), ignore=[collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError])
+    with warnings.catch_warnings():  # pycollada multiplies with numpy.matrix
+        warnings.simplefilter("ignore", PendingDeprecationWarning)
+        ignored = [collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
+        return _collada_scene(collada.Collada(str(path), ignore=ignored), path)
+
+
+def _collada_scene(scene: Any, path: Path) -> tuple[float, str, list[Part]]:
     if scene.scene is None:
         raise InputError.of("has no <scene>", file=path, suggestion="export it anew with its scene")
     parts = []
@@ -103,11 +112,10 @@ def _collada_part(node: str, geometry: Any, triangles: Any) -> Part:
     index = np.asarray(triangles.vertex_index, np.int64)
     colours = np.empty((len(index), 4), np.uint8)
     colours[:] = _collada_colour(material)
-    sources = geometry.primitives[0].sources.get("COLOR", ()) if geometry.primitives else ()
-    if len(sources) and len(geometry.primitives) == 1 and hasattr(geometry.primitives[0], "indices"):
-        offset, data = sources[0][0], np.asarray(sources[0][4].data, np.float64)
-        corners = data[np.asarray(geometry.primitives[0].indices).reshape(-1, *triangles.indices.shape[1:])[..., offset]]
-        colours[:, : data.shape[1]] = _to_bytes(corners.mean(axis=1))
+    original = getattr(triangles, "original", None)
+    for offset, _, _, _, source, *_ in original.sources.get("COLOR", ()) if original is not None else ():
+        data = np.asarray(source.data, np.float64)
+        colours[:, : data.shape[1]] = _to_bytes(data[np.asarray(original.indices)[..., offset]].mean(axis=1))
     return Part(tuple(dict.fromkeys(n for n in names if n)), np.asarray(triangles.vertex, np.float64), index, colours)
 
 
@@ -127,7 +135,7 @@ def _read_with_trimesh(path: Path) -> tuple[float, str, list[Part]]:
     import trimesh
 
     suffix = path.suffix.lower()
-    extra = {"split_object": True, "group_material": True} if suffix == ".obj" else {}
+    extra: dict[str, Any] = {"split_object": True, "group_material": True} if suffix == ".obj" else {}
     scene = trimesh.load_scene(str(path), process=False, **extra)
     parts = []
     for node in scene.graph.nodes_geometry:

@@ -13,6 +13,7 @@ from swarmsim.site.raster import Floats, Grid, Integers, edge_points, faces_on
 FILL_MIN = 0.75  # a box whose footprint is less filled than this is split
 AREA_SMALL = 0.3  # m2; a smaller box is not split
 BOXES_PER_COMPONENT = 24
+FLAT_M = 1e-3  # m; what is thinner than this was drawn as a surface
 SHEET_M = 0.01  # m; thickness of a surface whose file and specification give none
 VOLUME_SMALL, HEIGHT_SMALL = 0.1, 0.3  # m3, m; a component below both is no obstacle
 STEPPED = 0.3  # a long thing whose top varies more than this share of its height is cut in two
@@ -78,7 +79,7 @@ def boxes_of(corners: Floats, wall: float | None) -> list[Box]:
 def _points(corners: Floats, area: float) -> tuple[Floats, float]:
     """Points [p, 3] of the faces and edges of a component, and their spacing in m."""
     length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).sum()
-    spacing = max(0.1, (2.0 * area / POINTS_MAX) ** 0.5, 2.0 * length / POINTS_MAX)
+    spacing = max(0.1, (2.0 * area / POINTS_MAX) ** 0.5, length / POINTS_MAX)
     low = corners[..., :2].reshape(-1, 2).min(axis=0)
     size = np.ceil(np.ptp(corners[..., :2].reshape(-1, 2), axis=0) / spacing).astype(int) + 1
     grid = Grid((float(low[0]), float(low[1])), spacing, int(size[1]), int(size[0]))
@@ -141,21 +142,39 @@ def _split(cloud: Floats, spacing: float, angles: Floats) -> tuple[Floats, Float
     extent = np.ptp(local, axis=0)
     area = float(extent.prod())
     if extent[0] > 4.0 * extent[1] and extent[0] > 2.0 and _stepped(local[:, 0], cloud[:, 2]):
-        left = local[:, 0] < 0.5 * (local[:, 0].min() + local[:, 0].max())
-        return cloud[left], cloud[~left]
+        return _parted(cloud, local, axis, 0, 0.5 * (local[:, 0].min() + local[:, 0].max()), spacing)
     if area < AREA_SMALL or extent[1] < 2.0 * spacing or _fill(local, spacing) >= FILL_MIN:
         return None
-    saved, cut, side = max((*_best_cut(local, side), side) for side in (0, 1))
+    saved, cut, side = max((*_best_cut(local, side, spacing), side) for side in (0, 1))
     if saved < max(0.002 * area, 1e-3):
         return None
-    left = local[:, side] <= cut
-    return cloud[left], cloud[~left]
+    return _parted(cloud, local, axis, side, cut, spacing)
+
+
+def _parted(cloud: Floats, local: Floats, axis: Floats, side: int, cut: float, spacing: float) -> tuple[Floats, Floats]:
+    """The cloud on either side of a cut; where it only parts neighbouring rows of points, the emptier row is
+    drawn out to the other half, so that no gap opens between the two.
+    """
+    u = local[:, side]
+    left = u <= cut
+    edge, other = u[left].max(), u[~left].min()
+    halves = [cloud[left], cloud[~left]]
+    if other - edge < 1.5 * spacing:
+        rows = [cloud[left & (u > edge - 0.6 * spacing)], cloud[~left & (u < other + 0.6 * spacing)]]
+        emptier = int(len(rows[1]) < len(rows[0]))
+        along = np.array([axis[0], axis[1]]) if side == 0 else np.array([-axis[1], axis[0]])
+        place = rows[emptier][:, :2] @ along
+        drawn = rows[emptier].copy()
+        drawn[:, :2] += np.outer((other if emptier == 0 else edge) - place, along)
+        halves[emptier] = np.concatenate([halves[emptier], drawn])
+    return halves[0], halves[1]
 
 
 def _fill(local: Floats, spacing: float) -> float:
     """Share of the rectangle around ``local`` [n, 2] whose cells hold points."""
-    cells = np.floor((local - local.min(axis=0)) / (1.5 * spacing)).astype(np.int64)
-    size = cells.max(axis=0) + 1
+    low, extent = local.min(axis=0), np.ptp(local, axis=0)
+    size = np.maximum((extent / (1.5 * spacing)).astype(np.int64), 1)
+    cells = np.minimum(((local - low) / extent * size).astype(np.int64), size - 1)
     return len(np.unique(cells[:, 0] * size[1] + cells[:, 1])) / float(size.prod())
 
 
@@ -170,8 +189,11 @@ def _stepped(along: Floats, height: Floats) -> bool:
     return bool(np.ptp(top[used]) > STEPPED * own and np.ptp(bottom[used]) > STEPPED * own and own > 0.0)
 
 
-def _best_cut(local: Floats, side: int) -> tuple[float, float]:
-    """Area saved by cutting across ``side`` (0 or 1) into two rectangles, and the coordinate after which to cut."""
+def _best_cut(local: Floats, side: int, spacing: float) -> tuple[float, float]:
+    """Area saved by cutting across ``side`` (0 or 1) into two rectangles, and the coordinate after which to cut.
+
+    Every cut through the legs of a U saves about as much; of those, the one where most begins or ends is taken.
+    """
     order = np.argsort(local[:, side], kind="stable")
     u, v = local[order, side], local[order, 1 - side]
     if u[-1] - u[0] <= 0.0:
@@ -182,8 +204,14 @@ def _best_cut(local: Floats, side: int) -> tuple[float, float]:
     whole = (u[-1] - u[0]) * np.ptp(v)
     distinct = np.flatnonzero(np.diff(u) > 1e-6)
     both = left[distinct] + right[distinct + 1]
-    best = int(np.argmin(both))
-    return float(whole - both[best]), float(u[distinct[best]])
+    saved = whole - both
+    good = np.flatnonzero(saved >= 0.8 * saved.max() - 1e-9)
+    row = 0.6 * spacing
+    at, then = u[distinct[good]], u[distinct[good] + 1]
+    before = np.searchsorted(u, at, "right") - np.searchsorted(u, at - row, "left")
+    after = np.searchsorted(u, then + row, "right") - np.searchsorted(u, then, "left")
+    best = good[int(np.argmax(np.abs(before - after)))]
+    return float(saved[best]), float(u[distinct[best]])
 
 
 def _box(cloud: Floats, wall: float | None, angles: Floats, whole: bool) -> Box:
@@ -194,7 +222,7 @@ def _box(cloud: Floats, wall: float | None, angles: Floats, whole: bool) -> Box:
     half = np.append(0.5 * (high - low), 0.5 * np.ptp(cloud[:, 2]))
     thickness = wall or SHEET_M
     hollow = whole and wall is not None and bool((half > wall).all())
-    half = np.maximum(half, 0.5 * thickness if not hollow else 0.0)
+    half = np.where(half < 0.5 * FLAT_M, 0.5 * thickness, half)
     x = middle[0] * axis[0] - middle[1] * axis[1]
     y = middle[0] * axis[1] + middle[1] * axis[0]
     z = 0.5 * (cloud[:, 2].min() + cloud[:, 2].max())
@@ -206,7 +234,9 @@ def _box(cloud: Floats, wall: float | None, angles: Floats, whole: bool) -> Box:
 def footprint(box: Box, grid: Grid, margin: float = 0.0) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
     """A window of the grid and which of its cell centres lie in the box's footprint grown by ``margin`` m."""
     c, s = box.axis
-    reach = np.array([abs(c) * box.half[0] + abs(s) * box.half[1], abs(s) * box.half[0] + abs(c) * box.half[1]]) + margin
+    reach = (
+        np.array([abs(c) * box.half[0] + abs(s) * box.half[1], abs(s) * box.half[0] + abs(c) * box.half[1]]) + margin
+    )
     low = np.maximum(np.floor(grid.place(np.array(box.centre[:2]) - reach)).astype(int), 0)
     high = np.minimum(np.ceil(grid.place(np.array(box.centre[:2]) + reach)).astype(int) + 1, [grid.nx, grid.ny])
     window = (slice(low[1], max(high[1], low[1])), slice(low[0], max(high[0], low[0])))

@@ -83,7 +83,7 @@ def roof(length: float, width: float, eaves: float, ridge: float, overhang: floa
     x, y = 0.5 * length + overhang, 0.5 * width + overhang
     section = np.array([[-y, eaves], [y, eaves], [0.0, eaves + ridge]])
     west, east = (np.column_stack([np.full(3, side), section]) for side in (-x, x))
-    faces = [_quad(west[i], west[j], east[j], east[i])[:, ::-1] for i, j in ((0, 1), (1, 2), (2, 0))]
+    faces = [_quad(west[i], west[j], east[j], east[i]) for i, j in ((0, 1), (1, 2), (2, 0))]
     return joined([*faces, east[None], west[None, ::-1]])
 
 
@@ -106,7 +106,7 @@ def face_panels(length: float, width: float, storeys: int) -> Triangles:
             for k in range(count):
                 x = 3.2 * (k - 0.5 * (count - 1))
                 if not (side == 0 and storey == 0 and abs(x) < 2.2):  # the door is there
-                    panels.append(_quad(*((pane + [x, -0.5 * off - 0.03, 1.1 + 3.1 * storey]) @ turn)))
+                    panels.append(_quad(*((pane + np.array([x, -0.5 * off - 0.03, 1.1 + 3.1 * storey])) @ turn)))
     return joined(panels)
 
 

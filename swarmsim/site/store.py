@@ -81,17 +81,17 @@ def _arrays(spec: SiteSpec, site_file: Path) -> Arrays:
     source = site_file.parent / spec.file
     check_file(source, spec.max_file_mb)
     entry = cache_folder() / f"{spec.name}-{_key(spec, source)}.npz"
-    with contextlib.suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        with entry.open("rb") as file, np.load(file) as arrays:
-            return _sound(dict(arrays))
+    damaged = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+    with contextlib.suppress(*damaged), entry.open("rb") as file, np.load(file) as arrays:
+        return _sound(dict(arrays))
     from swarmsim.site.importer import build
 
     fresh = _pack(build(source, spec))
     with contextlib.suppress(OSError):  # a folder that cannot be written costs time, not the result
         entry.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as file:
-            np.savez(file, **fresh)
-        os.replace(file.name, entry)
+        with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as beside:
+            np.savez(beside, allow_pickle=False, **fresh)
+        os.replace(beside.name, entry)
     return fresh
 
 
@@ -181,7 +181,9 @@ def import_site(
     if out.exists() and not options.overwrite:
         raise InputError.of("there is something already", file=out, suggestion="choose another folder, or overwrite it")
     if out.exists() and not (out / "site.yaml").is_file():
-        raise InputError.of("is not a site, so it will not be overwritten", file=out, suggestion="choose another folder")
+        raise InputError.of(
+            "is not a site, so it will not be overwritten", file=out, suggestion="choose another folder"
+        )
     data = _specification(source, out, options)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as work:

@@ -5,6 +5,7 @@ swarmsim; sizes are those of common things (a 20 ft container: ISO 668; a roll-o
 """
 
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +124,9 @@ def _buildings() -> dict[tuple[str, str], Triangles]:
             parts[f"{name}_gables", wall] = _at(gables(length, width, eaves, ridge), place, yaw)
         storeys = max(1, int(eaves // 3.2))
         parts[f"{name}_windows", "window"] = _at(face_panels(length, width, storeys), place, yaw)
-        parts[f"{name}_door", "door"] = _at(placed(box(), 2.4, 0.06, 2.6) + [0.0, -0.5 * width, 0.0], place, yaw)
+        parts[f"{name}_door", "door"] = _at(
+            placed(box(), 2.4, 0.06, 2.6) + np.array([0.0, -0.5 * width, 0.0]), place, yaw
+        )
     outline = np.array(LABORATORY)
     base = float(ground_height(outline).min())
     parts["laboratory", "concrete_light"] = polygon_prism(outline, base, base + 6.5)
@@ -134,14 +137,15 @@ def _buildings() -> dict[tuple[str, str], Triangles]:
 def _skip() -> dict[tuple[str, str], Triangles]:
     """A roll-off container without a lid: 6 x 2.4 x 2.2 m, walls of 4 mm, standing north to south."""
     wall, long, wide, tall = 0.004, 6.0, 2.4, 2.2
+    inner = long - 2 * wall - 0.002  # a millimetre of air at the corners keeps the walls four pieces
     sides = [
-        placed(box(), wide, wall, tall) + [0.0, 0.5 * (long - wall), 0.0],
-        placed(box(), wide, wall, tall) - [0.0, 0.5 * (long - wall), 0.0],
-        placed(box(), wall, long - 2 * wall, tall) + [0.5 * (wide - wall), 0.0, 0.0],
-        placed(box(), wall, long - 2 * wall, tall) - [0.5 * (wide - wall), 0.0, 0.0],
+        placed(box(), wide, wall, tall) + np.array([0.0, 0.5 * (long - wall), 0.0]),
+        placed(box(), wide, wall, tall) - np.array([0.0, 0.5 * (long - wall), 0.0]),
+        placed(box(), wall, inner, tall) + np.array([0.5 * (wide - wall), 0.0, 0.0]),
+        placed(box(), wall, inner, tall) - np.array([0.5 * (wide - wall), 0.0, 0.0]),
     ]
     place = (*SKIP, _level(SKIP, wide, long, 0.0) + 0.05)
-    floor = placed(box(), wide - 0.1, long - 0.1, wall) + [0.0, 0.0, 0.03]
+    floor = placed(box(), wide - 0.1, long - 0.1, wall) + np.array([0.0, 0.0, 0.03])
     return {
         ("skip", "skip_steel"): _at(joined(sides), place, 0.0),
         ("skip_floor", "skip_floor"): _at(floor, place, 0.0),
@@ -166,10 +170,7 @@ def _yard_things() -> dict[tuple[str, str], Triangles]:
 
 def _fences() -> dict[tuple[str, str], Triangles]:
     def along(*corners: tuple[float, float]) -> NDArray[np.float64]:
-        runs = [
-            np.linspace(a, b, max(2, int(np.hypot(b[0] - a[0], b[1] - a[1]) / 6.0)))
-            for a, b in zip(corners[:-1], corners[1:], strict=True)
-        ]
+        runs = [np.linspace(a, b, max(2, int(np.hypot(b[0] - a[0], b[1] - a[1]) / 6.0))) for a, b in pairwise(corners)]
         line = np.concatenate([run[:-1] for run in runs] + [runs[-1][-1:]])
         return np.column_stack([line, ground_height(line)])
 
@@ -183,11 +184,13 @@ def _fences() -> dict[tuple[str, str], Triangles]:
 
 
 def _plants() -> dict[tuple[str, str], Triangles]:
-    trunks, dark, light = [], [], []
+    trunks: list[Triangles] = []
+    dark: list[Triangles] = []
+    light: list[Triangles] = []
     for i, (x, y, height) in enumerate(TREES):
         foot = (float(x), float(y), float(ground_height(np.array([x, y], np.float64))) - 0.1)
         trunks.append(_at(cylinder(0.035 * height, 0.45 * height, 6), foot, 0.0))
-        leaves = crown(0.26 * height, 0.36 * height) + [0.0, 0.0, 0.64 * height]
+        leaves = crown(0.26 * height, 0.36 * height) + np.array([0.0, 0.0, 0.64 * height])
         (dark if i % 2 else light).append(_at(leaves, foot, 37.0 * i))
     hedges = [_at(placed(box(), n, 1.1, h), (x, y, _level((x, y), n, 1.1, a)), a) for x, y, n, a, h in HEDGES]
     return {

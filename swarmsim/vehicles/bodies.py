@@ -1,7 +1,7 @@
-"""A vehicle's body from a URDF or xacro file: mass, inertia, wheels and the mesh to draw, in place of the specification's.
+"""A vehicle's body from a URDF or xacro file: mass, inertia, wheels and the mesh to draw.
 
-xacro is expanded by xacrodoc with the arguments of the specification, URDF is read by yourdfpy. Frames: the URDF's root link
-is taken as the body frame (x forward, y left, z up, as REP 103 has it), moved into the centre of mass.
+xacro is expanded by xacrodoc with the arguments of the specification, URDF is read by yourdfpy. Frames: the URDF's root
+link is taken as the body frame (x forward, y left, z up, as REP 103 has it), moved into the centre of mass.
 """
 
 import io
@@ -18,8 +18,8 @@ from xacro import XacroException
 from xacrodoc import XacroDoc
 
 from swarmsim.config.errors import InputError
-from swarmsim.config.vehicles import BodyFile
-from swarmsim.vehicles.skid_steer import RoverBody, steiner
+from swarmsim.config.vehicles import BodyFile, Multirotor
+from swarmsim.vehicles.rover_body import RoverBody, steiner
 
 Floats = NDArray[np.float64]
 
@@ -58,8 +58,10 @@ class FileBody:
 
 
 def read_body(source: BodyFile) -> FileBody:
-    """Read ``source``. Raises `InputError` for a missing file, bad xacro or URDF, an argument that the file does not
-    declare, and a body without mass."""  # noqa: D205, D209
+    """What the file ``source`` says.
+
+    Raises `InputError` for a missing file, bad xacro or URDF, an undeclared argument and a body without mass.
+    """
     path = Path(source.file)
     if not path.is_file():
         raise InputError.of(f"there is no body file {path}", file=path)
@@ -76,8 +78,11 @@ def read_body(source: BodyFile) -> FileBody:
 
 
 def read_rover_body(source: BodyFile) -> RoverBody:
-    """Body of a skid-steer rover: its wheels are the links of the four continuous joints, with cylinders or spheres as
-    collision (or visual) geometry. Raises `InputError` as `read_body`, and for a robot that is not such a rover."""  # noqa: D205, D209
+    """Body of a skid-steer rover: its wheels are the links of the four continuous joints.
+
+    Each wheel has a cylinder or sphere as collision (or visual) geometry. Raises `InputError` as `read_body` does, and
+    for a robot that is not such a rover.
+    """
     body = read_body(source)
     robot, path = body.robot, Path(body.file)
     joints = [joint for joint in robot.joint_map.values() if joint.type == "continuous"]
@@ -91,9 +96,7 @@ def read_rover_body(source: BodyFile) -> RoverBody:
     positions = np.array([frame[:3, 3] for frame in frames]) - body.centre_m
     signs = np.sign(positions[:, :2])
     if not np.array_equal(signs, [[1, 1], [1, -1], [-1, 1], [-1, -1]]):
-        raise InputError.of(
-            "the wheels must stand front left, front right, rear left and rear right of the centre of mass", file=path
-        )
+        raise InputError.of("the wheels must stand one on each side, front and rear, of the centre of mass", file=path)
     for joint, frame in zip(wheels, frames, strict=True):
         axle = frame[:3, :3] @ np.asarray(joint.axis, float)
         if abs(axle[1]) < 0.999 * np.linalg.norm(axle):
@@ -115,6 +118,20 @@ def read_rover_body(source: BodyFile) -> RoverBody:
         wheel_inertia_kg_m2=(float(inertia[1, 1]), float(0.5 * (inertia[0, 0] + inertia[2, 2]))),
         outline_m=bounds,
     )
+
+
+def with_file_body(spec: Multirotor) -> Multirotor:
+    """``spec`` with the mass and the inertia of its body file; as it is when it names none.
+
+    Raises `InputError` as `read_body` does, and when the body's axes are not its principal axes.
+    """
+    if spec.body is None:
+        return spec
+    body = read_body(spec.body)
+    diagonal = np.diag(body.inertia_kg_m2)
+    if np.abs(body.inertia_kg_m2 - np.diag(diagonal)).max() > 0.02 * diagonal.min():
+        raise InputError.of("the body's axes must be its principal axes: products of inertia above 2 %", file=body.file)
+    return spec.model_copy(update={"mass_kg": body.mass_kg, "inertia_kg_m2": tuple(map(float, diagonal))})
 
 
 def _urdf_text(path: Path, args: dict[str, str | float | int | bool]) -> str:
@@ -193,8 +210,8 @@ def _outline(
     robot: yourdfpy.URDF, centre_m: Floats, positions: Floats, radius: float, width: float
 ) -> tuple[float, float, float, float]:
     """Bounds (rear, front, right, left) of wheels and drawn geometry seen from above, from the centre of mass."""
-    low = positions[:, :2].min(axis=0) - [radius, 0.5 * width]
-    high = positions[:, :2].max(axis=0) + [radius, 0.5 * width]
+    wheel = np.array([radius, 0.5 * width])
+    low, high = positions[:, :2].min(axis=0) - wheel, positions[:, :2].max(axis=0) + wheel
     if robot.scene is not None and robot.scene.geometry:
         drawn = robot.scene.bounds[:, :2] - centre_m[:2]
         low, high = np.minimum(low, drawn[0]), np.maximum(high, drawn[1])

@@ -1,47 +1,30 @@
 """What a four-wheel skid-steer rover is: its parameters and its MJCF, both made from the specification."""
 
 import math
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from swarmsim.config.vehicles import SkidSteer
 from swarmsim.pytree import pytree
+from swarmsim.vehicles.rover_body import RoverBody, rover_body, steiner
 
 GRAVITY_M_S2 = 9.81
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 
-Floats = NDArray[np.float64]
-
-# Contact of a tyre in MuJoCo's terms. MuJoCo's relaxed friction lifts what slides: at its default settings a rover that turns
-# on the spot hops and turns at half the rate that Coulomb's law gives. It does not while friction x SLIP_DAMPING x slip
-# stays below load / (inverse mass x IMPEDANCE / (1 - IMPEDANCE)), some 0.9 m/s here. The stiff friction rows (FRICTION_RATIO)
-# keep a parked rover from creeping down a slope in spite of the small damping: 2 mm/s on 15 degrees.
+# Contact of a tyre in MuJoCo's terms. MuJoCo's relaxed friction lifts what slides: at its default settings a rover that
+# turns on the spot hops, and turns at half the rate that Coulomb's law gives. It does not hop while friction x
+# SLIP_DAMPING x slip stays below load x inverse mass x (1 - IMPEDANCE) / IMPEDANCE, that is up to 0.9 m/s of slip here.
+# The stiff friction rows (FRICTION_RATIO) keep a parked rover from creeping: 2 mm/s on a slope of 15 degrees.
 IMPEDANCE = 0.5  # solimp, constant over the depth
 FRICTION_RATIO = 100.0  # impratio
 SLIP_DAMPING_1_S = 10.0  # b of solreffriction
 
 
-@dataclass(frozen=True)
-class RoverBody:
-    """Masses and shape of a rover on the host; body frame FLU with its origin in the rover's centre of mass."""
-
-    mass_kg: float  # the whole rover
-    inertia_kg_m2: Floats  # [3, 3] the whole rover about its centre of mass
-    wheel_position_m: Floats  # [4, 3] wheel centres
-    wheel_radius_m: float
-    wheel_width_m: float
-    wheel_mass_kg: float
-    wheel_inertia_kg_m2: tuple[float, float]  # about the axle, across the axle
-    outline_m: tuple[float, float, float, float]  # rear, front, right, left bounds of the plan view (x, x, y, y)
-
-
 @pytree
 class SkidSteerParams:
-    """Everything of a rover that a sweep may vary. Body frame FLU, origin in the centre of mass; wheels FL, FR, RL, RR."""
+    """What a sweep may vary of a rover. Body frame FLU, origin in the centre of mass; wheels FL, FR, RL, RR."""
 
     mass_kg: jax.Array  # [] the whole rover
     inertia_kg_m2: jax.Array  # [3, 3] the whole rover about its centre of mass
@@ -72,42 +55,8 @@ class SkidSteerParams:
     gravity_m_s2: jax.Array  # []
 
 
-def rover_body(spec: SkidSteer) -> RoverBody:
-    """Body of the specification: a uniform box between four uniform discs, all upright over level ground."""
-    wheels = spec.wheels
-    x, y = 0.5 * wheels.wheel_base_m, 0.5 * wheels.track_m
-    chassis_mass = spec.mass_kg - 4.0 * wheels.mass_kg
-    height = (chassis_mass * spec.chassis_height_m + 4.0 * wheels.mass_kg * wheels.radius_m) / spec.mass_kg
-    hub = wheels.radius_m - height
-    wheel_position = np.array([[x, y, hub], [x, -y, hub], [-x, y, hub], [-x, -y, hub]])
-    axle = 0.5 * wheels.mass_kg * wheels.radius_m**2
-    across = wheels.mass_kg * (3.0 * wheels.radius_m**2 + wheels.width_m**2) / 12.0
-    sides = np.square(spec.chassis_size_m)
-    inertia = chassis_mass / 12.0 * np.diag(sides.sum() - sides)
-    inertia += steiner(chassis_mass, np.array([0.0, 0.0, spec.chassis_height_m - height]))
-    for position in wheel_position:
-        inertia += np.diag([across, axle, across]) + steiner(wheels.mass_kg, position)
-    front = max(0.5 * spec.chassis_size_m[0], x + wheels.radius_m)
-    side = max(0.5 * spec.chassis_size_m[1], y + 0.5 * wheels.width_m)
-    return RoverBody(
-        mass_kg=spec.mass_kg,
-        inertia_kg_m2=inertia,
-        wheel_position_m=wheel_position,
-        wheel_radius_m=wheels.radius_m,
-        wheel_width_m=wheels.width_m,
-        wheel_mass_kg=wheels.mass_kg,
-        wheel_inertia_kg_m2=(axle, across),
-        outline_m=(-front, front, -side, side),
-    )
-
-
-def steiner(mass_kg: float, offset_m: Floats) -> Floats:
-    """Inertia [3, 3] that ``mass_kg`` gains when its centre stands at ``offset_m`` [3] (parallel axes)."""
-    return mass_kg * (np.eye(3) * (offset_m @ offset_m) - np.outer(offset_m, offset_m))
-
-
 def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSteerParams:
-    """Parameters of ``spec``; ``body`` (from a URDF) takes the place of the body that the specification describes."""
+    """Parameters of ``spec``; ``body`` takes the place of the one that it describes."""
     body = body or rover_body(spec)
     rear, front, right, left = body.outline_m
     values = {
@@ -153,17 +102,18 @@ def wheel_spacing(wheel_position_m: jax.Array) -> tuple[jax.Array, jax.Array]:
 def effective_track(wheel_position_m: jax.Array) -> jax.Array:
     """Track [] (m) of the differential-drive robot that turns as the rover does while its tyres slip.
 
-    A skid-steer robot turns about centres of rotation of its left and right treads that lie outside them (Martinez et al.,
-    Int. J. Robotics Research 24(10), 2005; Mandow et al., IROS 2007). Their distance follows from the yaw balance of
-    equally loaded Coulomb contacts: each slips sideways at w b / 2, so it must slip along the wheel at w b^2 / (2 B), and
-    the tread's speed is w / 2 (B + b^2 / B) with the track B and the wheel base b, whatever the friction.
+    A skid-steer robot turns about centres of rotation of its left and right treads that lie outside them (Martinez et
+    al., Int. J. Robotics Research 24(10), 2005; Mandow et al., IROS 2007). Their distance follows from the balance of
+    yaw moments of equally loaded Coulomb contacts: each slips sideways at w b / 2, so it must slip along the wheel at
+    w b^2 / (2 B), and the tread's speed is w / 2 (B + b^2 / B) with the track B and the wheel base b, whatever the
+    friction.
     """
     base, track = wheel_spacing(wheel_position_m)
     return track + base * base / track
 
 
 def turning_force(params: SkidSteerParams, load_n: jax.Array) -> jax.Array:
-    """Force [] (N) along the wheels, all four together, that keeps a rover of total load ``load_n`` turning (see above)."""
+    """Force [] (N) along the wheels, all four together, that keeps a rover of weight ``load_n`` turning (see above)."""
     base, track = wheel_spacing(params.wheel_position_m)
     return params.friction * load_n * base * jax.lax.rsqrt(base * base + track * track)
 
@@ -193,7 +143,7 @@ def tyre_constants(spec: SkidSteer, body: RoverBody) -> tuple[float, float]:
 
 
 def tyre_creep(spec: SkidSteer, body: RoverBody) -> float:
-    """Slip (m/s) at which the regularised friction of MuJoCo's contact under a quarter of the weight has its full size."""
+    """Slip (m/s) at which MuJoCo's regularised friction under a quarter of the weight has its full size."""
     friction_mass = FRICTION_RATIO * IMPEDANCE / (1.0 - IMPEDANCE) / wheel_inverse_mass(spec, body)
     return 0.25 * body.mass_kg * GRAVITY_M_S2 * spec.wheels.friction / (friction_mass * SLIP_DAMPING_1_S)
 
@@ -232,8 +182,8 @@ def skid_steer_mjcf(spec: SkidSteer, body: RoverBody | None = None, time_step_s:
     return "\n".join(
         [
             f'<mujoco model="{spec.name}">',
-            f'<option timestep="{time_step_s}" gravity="0 0 -{GRAVITY_M_S2}" cone="elliptic" impratio="{FRICTION_RATIO}"'
-            ' jacobian="dense"><flag eulerdamp="disable"/></option>',
+            f'<option timestep="{time_step_s}" gravity="0 0 -{GRAVITY_M_S2}" cone="elliptic"'
+            f' impratio="{FRICTION_RATIO}" jacobian="dense"><flag eulerdamp="disable"/></option>',
             "<worldbody>",
             *planes,
             '<body name="chassis"><freejoint/>',

@@ -14,6 +14,7 @@ from swarmsim.estimation import Measurements, localisation_params, mapping_param
 from swarmsim.radiation import build_detector, load_library, observed_rate, restrict
 from swarmsim.site import Obstacles, Site
 
+_net_rates = jax.jit(net_rates)
 NUCLIDE = jnp.int32(0)  # the only one that the restricted detectors know: Co-60
 HALF = 70.0  # m, half the side of the surveyed square
 
@@ -88,7 +89,7 @@ def orbit(centre, radius, count, height=0.6, which=1):
 
 def mean_rates(site, detectors, measurements, sources=()):
     """Expected observed rate [n] of (position, activity) sources over the background."""
-    net = sum((a * net_rates(site, detectors, measurements, jnp.asarray(p), NUCLIDE) for p, a in sources), 0.0)
+    net = sum((a * _net_rates(site, detectors, measurements, jnp.asarray(p), NUCLIDE) for p, a in sources), 0.0)
     net = jnp.broadcast_to(net, measurements.counts.shape)
     rates = jnp.stack([jax.vmap(observed_rate, (None, 0))(d, net) for d in detectors])
     return jnp.take_along_axis(rates, measurements.detector[None], axis=0)[0]

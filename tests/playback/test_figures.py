@@ -49,7 +49,7 @@ def test_trajectories_show_every_track_over_the_buildings(found: MissionRecord, 
     axes = figure.axes[0]
     check_plan(axes)
     assert (*axes.get_xlim(), *axes.get_ylim()) == pytest.approx((-75, 75, -60, 60))
-    assert labels(axes) == ["uav1", "uav2", "uav3", "orpheus", "true source", "start", "buildings, trees"]
+    assert labels(axes) == ["uav1", "uav2", "uav3", "orpheus", "true source", "start", "obstacles"]
     drawn = {line.get_label(): line.get_xydata() for line in axes.lines}
     for vehicle in found.vehicles:
         track = drawn[vehicle.name]
@@ -70,7 +70,7 @@ def test_aerial_measurements_are_all_there_in_the_colour_of_their_rate(found: Mi
     np.testing.assert_allclose(np.asarray(dots.get_offsets()), samples.position_m[:, :2])
     rates = np.asarray(dots.get_array())
     expected = synthetic.rate_cps(samples.position_m)
-    assert np.abs(rates - expected).mean() < 0.25 * np.sqrt(expected.mean())  # eleven samples of a second averaged
+    assert np.abs(rates - expected).mean() < 0.3 * np.sqrt(expected.mean())  # 0.8 / sqrt(11) and the ends
     assert "Count rate, 1 s mean [1/s]" in texts(figure)
 
 
@@ -141,19 +141,12 @@ def test_print_quality(name: str, found: MissionRecord, site: SiteModel) -> None
     figure.canvas.draw()
     width = figure.get_figwidth()
     assert width in (plan.SINGLE_COLUMN_IN, plan.DOUBLE_COLUMN_IN)
-    renderer = figure.canvas.get_renderer()
-    edge = figure.bbox
-    for text in figure.findobj(Text):
-        if not text.get_visible() or not text.get_text():
-            continue
-        assert text.get_fontsize() >= 6.9, text
-        box = text.get_window_extent(renderer)
-        axes = text.axes
-        if axes is None or not axes.bbox.overlaps(box):  # clipped tick labels have no place of their own
-            assert edge.x0 <= box.x0, text
-            assert box.x1 <= edge.x1, text
-            assert edge.y0 <= box.y0, text
-            assert box.y1 <= edge.y1, text
+    assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= 6.9
+    ink = figure.get_tightbbox(figure.canvas.get_renderer())
+    assert ink.x0 >= 0.0, "cut off on the left"
+    assert ink.y0 >= 0.0, "cut off at the bottom"
+    assert ink.x1 <= width, "cut off on the right"
+    assert ink.y1 <= figure.get_figheight(), "cut off at the top"
 
 
 def test_written_in_four_seconds_at_300_dpi(found: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
@@ -164,8 +157,8 @@ def test_written_in_four_seconds_at_300_dpi(found: MissionRecord, site: SiteMode
     for path in written:
         pixels = matplotlib.image.imread(path)
         assert pixels.shape[1] in (1050, 2148)
-        colours = np.unique((pixels[..., :3].reshape(-1, 3) * 255).astype(np.uint8), axis=0)
-        assert len(colours) > 50
+        colours = (pixels[::3, ::3, :3] * 255).astype(np.int64) @ [1, 256, 65536]
+        assert len(np.unique(colours)) > 50
         ink = (pixels[..., :3] < 0.98).any(axis=-1)
         assert 0.03 < ink.mean() < 0.9
         assert path.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
@@ -176,7 +169,7 @@ def test_mission_without_a_source(nothing: MissionRecord, site: SiteModel, tmp_p
     assert "No spectrum: nothing was found to identify." in texts(figures.spectrum(nothing, site))
     assert "no measurements\non the ground" in texts(figures.ground_measurements(nothing, site))
     whole = figures.radiation_map(nothing, site).axes[0]
-    assert labels(whole) == ["buildings, trees"]
+    assert labels(whole) == ["obstacles"]
     # An even map is one colour, and the same in both panels.
     first, second = (axes.images[-1] for axes in whole.figure.axes[:2])
     assert first.norm.vmin == second.norm.vmin

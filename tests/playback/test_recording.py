@@ -190,16 +190,16 @@ def test_plots_hold_every_rate_and_the_battery_in_percent(recording: Recording, 
 def test_spectrum_keeps_every_count_and_labels_its_lines(recording: Recording, found: MissionRecord) -> None:
     assert found.spectrum is not None
     _, (values,) = recording.rows("/spectrum/measured", "BarChart:values")
-    assert sum(values[0]["buffer"]["inner"] if "inner" in values[0]["buffer"] else values[0]["buffer"]) == pytest.approx(
-        found.spectrum.counts.sum()
-    )
+    assert sum(
+        values[0]["buffer"]["inner"] if "inner" in values[0]["buffer"] else values[0]["buffer"]
+    ) == pytest.approx(found.spectrum.counts.sum())
     assert {"/spectrum/Co-60_1173_keV", "/spectrum/Co-60_1332_keV", "/spectrum/fit"} <= set(recording.tables)
 
 
 def test_log_tells_the_mission_in_order(recording: Recording, found: MissionRecord) -> None:
     times, texts = recording.rows("/log/mission", "TextLog:text")
     told = [text[0] for text in texts]
-    assert told[0] == "aerial phase begins"
+    assert told[0] == "aerial survey begins"
     assert any(text.startswith("uav2: landed") for text in told)
     assert any(text.startswith("final estimate: 12.12 ± 0.14 m east") for text in told)
     assert found.finding in told
@@ -222,7 +222,9 @@ def test_mission_without_a_source(nothing: MissionRecord, site: SiteModel, tmp_p
     assert verify(path).returncode == 0
     recording = Recording(path)
     entities = set(recording.tables)
-    assert not any(e.startswith(("/world/estimate", "/world/truth", "/world/route", "/world/hotspots")) for e in entities)
+    assert not any(
+        e.startswith(("/world/estimate", "/world/truth", "/world/route", "/world/hotspots")) for e in entities
+    )
     _, (note,) = recording.rows("/spectrum", "TextDocument:text")
     assert "nothing was found" in note[0]
     _, texts = recording.rows("/log/mission", "TextLog:text")

@@ -1,10 +1,10 @@
 """Detectors of both kinds, built once for the radiation tests."""
 
 import pytest
-from tests.radiation.points import MOUNT
 
 from swarmsim.config.load import load_named
 from swarmsim.radiation import KINDS, Detector, Library, build_detector, load_library
+from tests.radiation.points import MOUNT
 
 
 @pytest.fixture(scope="session")

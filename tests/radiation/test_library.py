@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.radiation.points import MOUNT
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.files import packaged_dir
@@ -13,6 +12,7 @@ from swarmsim.config.radiation import Detector, Material
 from swarmsim.radiation import Library, build_detector, load_library
 from swarmsim.radiation.build_up import fit, number_build_up, scattered_fraction, transport
 from swarmsim.radiation.library import BUILD_UP_SCALE, build_up_coefficients, linear_attenuation, mass_attenuation
+from tests.radiation.points import MOUNT
 
 # NIST tables at 59.5, 662, 1173 and 1332 keV, cm2/g
 NIST = {

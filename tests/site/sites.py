@@ -10,9 +10,9 @@ from swarmsim.site import Obstacles, Site
 MATERIALS = ("air", "brick", "concrete", "soil", "steel", "vegetation", "wood")
 
 
-def make_site(boxes=(), terrain=None, cell=1.0, origin=(-300.0, -300.0), materials=MATERIALS):
+def make_site(boxes=(), terrain=None, cell=100.0, origin=(-300.0, -300.0), materials=MATERIALS):
     """A site with ``boxes`` (centre, half, yaw, wall, material) on ``terrain`` [ny, nx]; deep below zero by default."""
-    terrain = np.full((601, 601), -1e3) if terrain is None else np.asarray(terrain)
+    terrain = np.full((7, 7), -1e3) if terrain is None else np.asarray(terrain)
     boxes = boxes or (((0, 0, 0), (0, 0, 0), 0.0, 0.0, materials[0]),)
     centre, half, yaw, wall, names = zip(*boxes, strict=True)
     yaw = np.array(yaw)
@@ -62,7 +62,7 @@ def block(size, centre, yaw=0.0) -> trimesh.Trimesh:
 
 
 def yard(slope=0.0) -> trimesh.Scene:
-    """A plate of 40 m x 30 m with a house of 8 x 6 x 5 m at (5, 3), turned by 0.3 rad, and a post of 3 m at (-10, -5)."""
+    """A plate of 40 m x 30 m, a house of 8 x 6 x 5 m at (5, 3) turned by 0.3 rad, and a post of 3 m at (-10, -5)."""
     scene = trimesh.Scene()
     scene.add_geometry(ground_plate(slope=slope), geom_name="plate")
     scene.add_geometry(block((8, 6, 5), (5, 3, 2.5), 0.3), geom_name="house")

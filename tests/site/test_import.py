@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rasterio
 import trimesh
-from rasterio.transform import from_origin
+from rasterio.transform import Affine
 from scipy.ndimage import map_coordinates
 from sites import MATERIALS, block, ground_plate, spec, yard
 
@@ -146,7 +146,10 @@ def test_crown_above_a_rover_does_not_stop_it_but_its_trunk_does(tmp_path):
     scene.add_geometry(block((1.0, 1.0, 0.1), (10, 0, 0.05)), geom_name="kerb")
     scene.add_geometry(block((2.0, 2.0, 0.8), (-10, 0, 0.4)), geom_name="grass")
     raw = built(tmp_path, scene, obstacles=[{"match": "grass", "material": "vegetation", "traversable": True}])
-    at = {x: raw.clearance[np.unravel_index(raw.grid.cell_of(np.array([x, 0.25])), raw.terrain.shape)] for x in (0.25, 1.25, 10.25, -9.75)}
+    at = {
+        x: raw.clearance[np.unravel_index(raw.grid.cell_of(np.array([x, 0.25])), raw.terrain.shape)]
+        for x in (0.25, 1.25, 10.25, -9.75)
+    }
     assert at[0.25] < 0.2
     assert at[1.25] == pytest.approx(1.1, abs=0.2)
     assert at[10.25] > 5.0
@@ -164,10 +167,12 @@ def test_surface_sampled_anywhere_is_not_below_the_mesh(tmp_path):
         top = highest(fine, faces_on(fine, mesh.triangles), -np.inf)
         place = fine.place(points)
         true = np.maximum(true, top[np.rint(place[:, 1]).astype(int), np.rint(place[:, 0]).astype(int)])
-    at = grid.place(np.stack([fine.origin[0] + 0.1 * np.rint(place[:, 0]), fine.origin[1] + 0.1 * np.rint(place[:, 1])], -1))
+    at = grid.place(
+        np.stack([fine.origin[0] + 0.1 * np.rint(place[:, 0]), fine.origin[1] + 0.1 * np.rint(place[:, 1])], -1)
+    )
     surface = map_coordinates(raw.surface, [at[:, 1], at[:, 0]], order=1)
     assert (surface >= true - 1e-3).all()
-    open_ground = (raw.clearance > 1.5)
+    open_ground = raw.clearance > 1.5
     np.testing.assert_array_equal(raw.surface[open_ground], raw.terrain[open_ground])
 
 
@@ -201,7 +206,7 @@ def test_round_outline_is_outside_and_surveyed_within(tmp_path):
 
 def write_tiff(path, rows, cell=5.0, **more):
     profile = {"driver": "GTiff", "height": rows.shape[-2], "width": rows.shape[-1], "count": 1, "dtype": rows.dtype}
-    profile |= {"crs": "EPSG:32632", "transform": from_origin(500_000.0, 5_200_000.0, cell, cell)} | more
+    profile |= {"crs": "EPSG:32632", "transform": Affine(cell, 0.0, 500_000.0, 0.0, -cell, 5_200_000.0)} | more
     with rasterio.open(path, "w", **profile) as file:
         file.write(rows if rows.ndim == 3 else rows[None])
 
@@ -224,7 +229,11 @@ def test_geotiff_rows_run_north_to_south(tmp_path):
     red = raw.mesh.colours[:, 0] == 200
     assert raw.mesh.vertices_m[red, 1].min() > -10.0
     finer = build(tmp_path / "dem.tif", spec(file="dem.tif", cell_m=2.0))
-    np.testing.assert_allclose(finer.terrain[2:-2, 2:-2], (0.02 * finer.grid.centres[..., 0] + 0.05 * finer.grid.centres[..., 1])[2:-2, 2:-2], atol=2e-3)
+    np.testing.assert_allclose(
+        finer.terrain[2:-2, 2:-2],
+        (0.02 * finer.grid.centres[..., 0] + 0.05 * finer.grid.centres[..., 1])[2:-2, 2:-2],
+        atol=2e-3,
+    )
 
 
 def test_visual_mesh_is_thinned(tmp_path):
@@ -251,7 +260,9 @@ def test_import_site_writes_all_or_nothing(tmp_path):
     import_site(tmp_path / "yard.glb", out, ImportOptions(overwrite=True, preview=False), MATERIALS)
     assert not (out / "preview.png").exists()
     with pytest.raises(InputError, match="matches 'lawn'"):
-        import_site(tmp_path / "yard.glb", tmp_path / "sites" / "other", ImportOptions(fields={"ground": ["lawn"]}), MATERIALS)
+        import_site(
+            tmp_path / "yard.glb", tmp_path / "sites" / "other", ImportOptions(fields={"ground": ["lawn"]}), MATERIALS
+        )
     assert [p.name for p in (tmp_path / "sites").iterdir()] == ["my_yard"]
 
 
@@ -277,3 +288,30 @@ def test_edges_reach_the_cells_that_thin_walls_stand_in():
     assert len(faces_on(grid, wall).cell) == 0
     top = highest(grid, edges_on(grid, wall), 0.0)
     np.testing.assert_array_equal(top[2] > 0, [False, True, True, True, True, False])
+
+
+def test_collada_vertex_colours_are_kept(tmp_path):
+    """A copy of the writer's mesh with one more input: a colour for every vertex."""
+    path = tmp_path / "plate.dae"
+    write_collada(path, {("plate", "stone"): ground_plate(pieces=4).triangles}, {"stone": (0.5, 0.5, 0.5)})
+    text = path.read_text()
+    source = (
+        '<source id="shade"><float_array id="shades" count="3">1 0.2 0</float_array><technique_common>'
+        '<accessor source="#shades" count="1" stride="3"><param name="R" type="float"/><param name="G" type="float"/>'
+        '<param name="B" type="float"/></accessor></technique_common></source><vertices'
+    )
+    text = text.replace("<vertices", source).replace("<p>", '<input semantic="COLOR" source="#shade" offset="1"/><p>')
+    head, index = text.split("<p>")
+    corners, tail = index.split("</p>")
+    path.write_text(head + "<p>" + " ".join(f"{i} 0" for i in corners.split()) + "</p>" + tail)
+    raw = build(path, spec(file="plate.dae"))
+    assert {tuple(c) for c in raw.mesh.colours.tolist()} == {(255, 51, 0, 255)}
+
+
+def test_trimesh_colours_are_kept(tmp_path):
+    scene = yard()
+    scene.geometry["house"].visual.face_colors = [200, 60, 40, 255]
+    raw = built(tmp_path, scene)
+    colours = {tuple(c) for c in raw.mesh.colours.tolist()}
+    assert (200, 60, 40, 255) in colours
+    assert len(colours) == 3

@@ -1,0 +1,90 @@
+"""Rovers and sites for the tests of the skid-steer physics, and the same rover in MuJoCo C."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import yaml
+
+from swarmsim.config.vehicles import SkidSteer
+from swarmsim.physics.skid_steer import make_skid_steer_step, rest_state
+from swarmsim.physics.wheels import ROLLING_ONSET_RAD_S
+from swarmsim.site import Obstacles, Site
+from swarmsim.vehicles.skid_steer import skid_steer_mjcf, skid_steer_params
+
+FILE = Path(__file__).parents[2] / "configs" / "vehicles" / "orpheus.yaml"
+SPEC = SkidSteer(**yaml.safe_load(FILE.read_text()))
+PARAMS = skid_steer_params(SPEC)
+DT = 0.005
+STEP = {engine: make_skid_steer_step(SPEC, engine, DT) for engine in ("mjx", "analytic")}
+ENGINES = tuple(STEP)
+
+
+def plane_site(slope=(0.0, 0.0), wall_east_m=None, cells=80, cell=1.0) -> Site:
+    """Plane ground of ``slope`` (rise per metre), with a wall that fills all that is east of ``wall_east_m``."""
+    axis = (np.arange(cells) - cells // 2) * cell
+    x, y = np.meshgrid(axis, axis)
+    terrain = jnp.asarray(slope[0] * x + slope[1] * y, jnp.float32)
+    clearance = np.full_like(x, 30.0) if wall_east_m is None else wall_east_m - x
+    return Site(
+        origin_m=jnp.full(2, axis[0], jnp.float32),
+        cell_m=jnp.float32(cell),
+        terrain_m=terrain,
+        surface_m=terrain,
+        clearance_m=jnp.asarray(clearance, jnp.float32),
+        cost=jnp.ones_like(terrain),
+        obstacles=Obstacles(
+            centre_m=jnp.zeros((1, 3)),
+            half_extent_m=jnp.zeros((1, 3)),
+            axis=jnp.array([[1.0, 0.0]]),
+            wall_m=jnp.zeros(1),
+            material=jnp.zeros(1, jnp.int32),
+        ),
+        survey_area_m=jnp.zeros((4, 2)),
+        ground_material=jnp.int32(0),
+        material_names=("soil",),
+    )
+
+
+def _drive(engine, params, state, commands, site):
+    def one(state, command):
+        state = STEP[engine](params, state, command, site)
+        return state, state
+
+    return jax.lax.scan(one, state, commands)[1]
+
+
+_DRIVE = jax.jit(_drive, static_argnums=0)
+
+
+def drive(engine, command, seconds, site=None, params=PARAMS, state=None, yaw=0.0):
+    """States [n, ...] after each step of driving ``command`` [4] (or [n, 4]) from rest at the origin."""
+    site = plane_site() if site is None else site
+    state = rest_state(params, site, jnp.zeros(2), yaw) if state is None else state
+    commands = jnp.broadcast_to(jnp.asarray(command, jnp.float32), (round(seconds / DT), 4))
+    return _DRIVE(engine, params, state, commands, site)
+
+
+def last(states):
+    """The last of ``states``."""
+    return jax.tree.map(lambda x: x[-1], states)
+
+
+def mujoco_drive(command, seconds, dt, gravity=(0.0, 0.0, -9.81)):
+    """MuJoCo C's data after driving ``command`` [4] from rest on level ground with the motors' and tyres' laws in float64."""
+    model = mujoco.MjModel.from_xml_string(skid_steer_mjcf(SPEC, time_step_s=dt))
+    model.opt.gravity[:] = gravity
+    data = mujoco.MjData(model)
+    data.qpos[2] -= float(PARAMS.tyre_sinkage_m)
+    p = jax.tree.map(lambda x: np.asarray(x, float), PARAMS)
+    resistance = p.rolling_resistance * 0.25 * p.mass_kg * p.gravity_m_s2 * p.wheel_radius_m
+    torque, command = np.zeros(4), np.asarray(command, float)
+    for _ in range(round(seconds / dt)):
+        speed = data.qvel[6:10]
+        wanted = np.clip(p.speed_gain_nm_s * (command - speed), -p.torque_max_nm, p.torque_max_nm)
+        torque = wanted + (torque - wanted) * np.exp(-dt / p.motor_time_constant_s)
+        data.ctrl[:] = torque - resistance * np.tanh(speed / ROLLING_ONSET_RAD_S)
+        mujoco.mj_step(model, data)
+    return data

@@ -1,0 +1,125 @@
+"""The rover's engines against MuJoCo C and against each other."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+from tests.physics.rovers import DT, PARAMS, SPEC, drive, last, mujoco_drive
+
+from swarmsim.physics import wheel_contact
+from swarmsim.physics.rotations import from_rotation_vector, yaw_of
+from swarmsim.physics.wheels import rotation_matrix
+from swarmsim.vehicles.rover_body import rover_body
+from swarmsim.vehicles.skid_steer import skid_steer_mjcf, wheel_inverse_mass
+
+COMMANDS = {
+    "straight": (5.0, 5.0, 5.0, 5.0),
+    "gentle arc": (4.0, 5.0, 4.0, 5.0),
+    "arc": (3.0, 5.0, 3.0, 5.0),
+    "sharp arc": (1.0, 3.0, 1.0, 3.0),
+    "reverse": (-2.0, -4.0, -2.0, -4.0),
+}
+SKID_TURN = (-3.0, 3.0, -3.0, 3.0)
+
+
+def turned(states):
+    """Degrees turned over ``states``."""
+    return float(np.degrees(np.unwrap(np.asarray(yaw_of(states.body.quaternion)))[-1]))
+
+
+def test_a_skid_turn_of_5_s_ends_where_mujoco_c_ends_it_at_half_a_millisecond():
+    reference = mujoco_drive(SKID_TURN, 5.0, 0.0005)
+    expected = np.degrees(float(yaw_of(jnp.asarray(reference.qpos[3:7]))))
+    difference = (turned(drive("mjx", SKID_TURN, 5.0)) - expected + 180.0) % 360.0 - 180.0
+    assert abs(difference) < 2.0  # of 250 degrees turned
+
+
+@pytest.mark.parametrize("name", ["straight", "arc", "sharp arc"])
+def test_paths_end_where_mujoco_c_ends_them_at_half_a_millisecond(name):
+    reference = mujoco_drive(COMMANDS[name], 5.0, 0.0005)
+    states = drive("mjx", COMMANDS[name], 5.0)
+    length = float(jnp.sum(jnp.linalg.norm(jnp.diff(states.body.position_m, axis=0), axis=-1)))
+    assert np.linalg.norm(last(states).body.position_m[:2] - reference.qpos[:2]) < 0.01 * length
+    np.testing.assert_allclose(last(states).wheel_speed_rad_s, reference.qvel[6:10], atol=0.03)
+
+
+def test_the_mjcf_weighs_what_the_body_does():
+    body = rover_body(SPEC)
+    model = mujoco.MjModel.from_xml_string(skid_steer_mjcf(SPEC))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert model.body_subtreemass[0] == pytest.approx(SPEC.mass_kg)
+    chassis = model.body("chassis").id
+    np.testing.assert_allclose(data.subtree_com[chassis] - data.xpos[chassis], 0.0, atol=1e-7)
+    assert model.body_invweight0[model.body("front_left").id, 0] == pytest.approx(
+        wheel_inverse_mass(SPEC, body), rel=1e-6
+    )
+    full = np.zeros((10, 10))
+    mujoco.mj_fullM(model, full, data.qM)
+    np.testing.assert_allclose(full, wheel_contact.mass_matrix(PARAMS), atol=1e-4)
+
+
+def random_state(seed):
+    """MuJoCo coordinates of a rover that moves, tilted, with tyres in and out of the ground."""
+    rng = np.random.default_rng(seed)
+    quaternion = np.asarray(from_rotation_vector(jnp.asarray(rng.normal(0.0, [0.01, 0.01, 1.0]), jnp.float32)), float)
+    qpos = np.concatenate([rng.normal(0.0, 0.002, 3), quaternion, np.zeros(4)])
+    qpos[2] -= 0.002
+    qvel = np.concatenate(
+        [rng.normal(0.0, [0.5, 0.5, 0.05]), rng.normal(0.0, [0.1, 0.1, 0.6]), rng.normal(0.0, 3.0, 4)]
+    )
+    return qpos, qvel, rng.normal(0.0, 10.0, 4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_accelerations_are_those_of_mujoco_on_the_same_mjcf(seed):
+    qpos, qvel, torque = random_state(seed)
+    model = mujoco.MjModel.from_xml_string(skid_steer_mjcf(SPEC, time_step_s=DT))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, torque
+    mujoco.mj_forward(model, data)
+    assert 0 < data.ncon <= 4
+    problem = wheel_contact.contact_problem(SPEC, rover_body(SPEC), DT, iterations=30, line_search=30)
+    rotation = rotation_matrix(jnp.asarray(qpos[3:7], jnp.float32))
+    hub = jnp.asarray(qpos[:3], jnp.float32) + PARAMS.wheel_position_m @ rotation.T
+    ground = PARAMS.wheel_position_m[:, 2] - PARAMS.wheel_radius_m
+    distance = hub[:, 2] - ground - PARAMS.wheel_radius_m
+    normal = jnp.tile(jnp.array([0.0, 0.0, 1.0]), (4, 1)) @ rotation
+    twist = jnp.concatenate([jnp.asarray(qvel[:3], jnp.float32) @ rotation, jnp.asarray(qvel[3:], jnp.float32)])
+    weight = jnp.array([0.0, 0.0, -SPEC.mass_kg * 9.81]) @ rotation
+    smooth = wheel_contact.smooth_force(PARAMS, twist, weight, jnp.zeros(3), jnp.asarray(torque, jnp.float32))
+    got = wheel_contact.accelerations(problem, PARAMS, twist, smooth, distance, normal)
+    expected = np.concatenate([data.qacc[:3] @ np.asarray(rotation), data.qacc[3:]])
+    np.testing.assert_allclose(got, expected, atol=2e-3 * np.abs(expected).max())
+
+
+def test_a_whole_mjx_step_gives_the_same_speeds():
+    qpos, qvel, torque = random_state(7)
+    model = mujoco.MjModel.from_xml_string(skid_steer_mjcf(SPEC, time_step_s=DT))
+    model.opt.iterations, model.opt.ls_iterations = 4, 6
+    device = mjx.put_model(model)
+    data = mjx.make_data(model).replace(
+        qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32), ctrl=jnp.asarray(torque, jnp.float32)
+    )
+    after = jax.jit(mjx.step)(device, data)
+    exact = mujoco.MjData(model)
+    model.opt.iterations = 100
+    exact.qpos[:], exact.qvel[:], exact.ctrl[:] = qpos, qvel, torque
+    mujoco.mj_step(model, exact)
+    np.testing.assert_allclose(after.qvel, exact.qvel, atol=0.02)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_engines_paths_agree_within_5_percent_of_the_distance(name):
+    paths = {engine: drive(engine, COMMANDS[name], 8.0).body.position_m for engine in ("mjx", "analytic")}
+    length = float(jnp.sum(jnp.linalg.norm(jnp.diff(paths["mjx"], axis=0), axis=-1)))
+    apart = jnp.linalg.norm(paths["mjx"] - paths["analytic"], axis=-1)
+    assert float(apart.max()) < 0.05 * length
+
+
+def test_the_engines_turn_in_place_alike():
+    angles = [turned(drive(engine, SKID_TURN, 8.0)) for engine in ("mjx", "analytic")]
+    assert angles[1] == pytest.approx(angles[0], rel=0.05)
+    assert angles[0] > 300.0
