@@ -146,8 +146,8 @@ def interpolate(params: MappingParams, measurements: Measurements) -> RadiationM
 
     The background level is the median of a kernel-smoothed rate over the windows; the noise of a window is the
     Poisson variance at its smoothed (not its own) count, as weights from own counts would favour low draws; the
-    prior's variance is the mean square of the smoothed excess (empirical Bayes). All are finite for any input;
-    without a valid sample the map is 0 ± 1 and insignificant.
+    prior's variance is the mean square of the smoothed excess (empirical Bayes), at least the noise of one window.
+    All are finite for any input; without a valid sample the map is 0 ± 1 and insignificant.
     """
     m = cleared(measurements)
     rate, noise, background, variance = _levels(params, m)
@@ -185,9 +185,10 @@ def _levels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Arra
     background = jnp.where(number > 0, jnp.mean(middle), 0.0)
     share = m.valid / jnp.maximum(number, 1)
     excess = jnp.sum(share * (smoothed - background) ** 2)
-    # The prior is kept within what float32 normal equations can hold, and above what would switch the data off.
+    # At least the noise of one window: an unmeasured place is not known better than one measured once. At most what
+    # normal equations in float32 can hold.
     scale = jnp.where(number > 0, jnp.sum(share * noise), 1.0)
-    variance = jnp.where(number > 0, jnp.clip(excess, 1e-3 * scale, 1e3 * scale), 1.0)
+    variance = jnp.where(number > 0, jnp.clip(excess, scale, 1e3 * scale), 1.0)
     return counts / live, noise, background, variance
 
 

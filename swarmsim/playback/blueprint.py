@@ -71,8 +71,8 @@ def _scene(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spat
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=centre + across * np.array([-0.09, -0.57, 0.42]),
-            look_target=centre + across * np.array([0.0, -0.08, 0.0]),
+            position=centre + across * np.array([-0.09, -0.61, 0.44]),
+            look_target=centre + across * np.array([0.0, -0.10, 0.0]),
             eye_up=[0.0, 0.0, 1.0],
         ),
         overrides=_growing(record),
@@ -101,8 +101,9 @@ def _plots(record: MissionRecord) -> rrb.Container:
     """Count rates and batteries against the time of the phase that they belong to."""
     whole = (min(p.start_s for p in record.phases), record.end_s)
 
-    def plot(origin: str, name: str, span: tuple[float, float]) -> rrb.TimeSeriesView:
-        start, end = (rrb.TimeRangeBoundary.absolute(seconds=s) for s in span)
+    def plot(origin: str, name: str, span: tuple[float, float] | None) -> rrb.TimeSeriesView:
+        shown = span if span is not None and span[1] > span[0] else whole
+        start, end = (rrb.TimeRangeBoundary.absolute(seconds=s) for s in shown)
         return rrb.TimeSeriesView(
             origin=origin,
             name=name,
@@ -111,8 +112,8 @@ def _plots(record: MissionRecord) -> rrb.Container:
         )
 
     return rrb.Horizontal(
-        plot("plots/aerial_rate", "Count rate, air [1/s]", record.span("aerial") or whole),
-        plot("plots/ground_rate", "Count rate, ground [1/s]", record.span("ground") or whole),
+        plot("plots/aerial_rate", "Count rate, air [1/s]", record.span("aerial")),
+        plot("plots/ground_rate", "Count rate, ground [1/s]", record.span("ground")),
         rrb.Tabs(plot("plots/battery", "Battery [%]", whole), plot("plots/height", "Height above ground [m]", whole)),
     )
 

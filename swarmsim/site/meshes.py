@@ -112,7 +112,7 @@ def _collada_part(node: str, geometry: Any, triangles: Any) -> Part:
     index = np.asarray(triangles.vertex_index, np.int64)
     colours = np.empty((len(index), 4), np.uint8)
     colours[:] = _collada_colour(material)
-    original = getattr(triangles, "original", None)
+    original: Any = getattr(triangles, "original", None)
     for offset, _, _, _, source, *_ in original.sources.get("COLOR", ()) if original is not None else ():
         data = np.asarray(source.data, np.float64)
         colours[:, : data.shape[1]] = _to_bytes(data[np.asarray(original.indices)[..., offset]].mean(axis=1))

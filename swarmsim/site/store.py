@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -188,14 +188,10 @@ def import_site(
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as work:
         made = Path(work) / out.name
-        made.mkdir()
-        (made / "site.yaml").write_text(dump_yaml(data), encoding="utf-8")
-        spec: SiteSpec = load_model(made / "site.yaml", SiteSpec)
-        _check_materials(spec, material_names, made / "site.yaml")
-        shutil.copyfile(source, made / spec.file)
-        if spec.orthophoto is not None:
-            shutil.copyfile(source.parent / Path(spec.orthophoto).name, made / spec.orthophoto)
-        model = _model(spec, _arrays(spec, made / "site.yaml"), material_names)
+        try:
+            model = _make(made, source, data, material_names)
+        except InputError as error:
+            raise InputError([_seen_from_outside(p, Path(work), out, source) for p in error.problems]) from error
         if options.preview:
             from swarmsim.site.preview import write_preview
 
@@ -204,6 +200,26 @@ def import_site(
             out.rename(Path(work) / "replaced")
         made.rename(out)
     return model
+
+
+def _make(made: Path, source: Path, data: dict[str, Any], material_names: Sequence[str]) -> SiteModel:
+    """Write a site's specification and files into the new folder ``made``, and load it."""
+    made.mkdir()
+    (made / "site.yaml").write_text(dump_yaml(data), encoding="utf-8")
+    spec: SiteSpec = load_model(made / "site.yaml", SiteSpec)
+    _check_materials(spec, material_names, made / "site.yaml")
+    shutil.copyfile(source, made / spec.file)
+    if spec.orthophoto is not None:
+        shutil.copyfile(source.parent / spec.orthophoto, made / spec.orthophoto)
+    return _model(spec, _arrays(spec, made / "site.yaml"), material_names)
+
+
+def _seen_from_outside(problem: Problem, work: Path, out: Path, source: Path) -> Problem:
+    """A problem that names the user's files, not the folder in which the site was being made."""
+    if problem.file is None or work.name not in problem.file:
+        return problem
+    name = Path(problem.file).name
+    return replace(problem, file=str(source if name == source.name else out / name), line=None)
 
 
 def _specification(source: Path, out: Path, options: ImportOptions) -> dict[str, Any]:

@@ -11,6 +11,8 @@ from swarmsim.estimation import aggregate, concatenate
 from swarmsim.estimation.measurements import cleared
 from tests.estimation.survey import windows
 
+_aggregate = jax.jit(aggregate, static_argnums=1)
+
 
 def random_samples(n, seed):
     rng = np.random.default_rng(seed)
@@ -24,10 +26,10 @@ def random_samples(n, seed):
     )
 
 
-@given(n=st.integers(1, 60), per_window=st.integers(1, 13), seed=st.integers(0, 2**31))
+@given(n=st.sampled_from([1, 7, 40]), per_window=st.sampled_from([1, 3, 11]), seed=st.integers(0, 2**31))
 def test_windows_keep_counts_exposure_and_centre(n, per_window, seed):
     samples = random_samples(n, seed)
-    summed = aggregate(samples, per_window)
+    summed = _aggregate(samples, per_window)
     valid = np.asarray(samples.valid)
     exposure = np.where(valid, samples.exposure_s, 0.0).astype(np.float64)
     assert summed.counts.shape == (-(-n // per_window),)
@@ -51,7 +53,7 @@ def test_contents_of_padding_never_matter():
         counts=jnp.where(samples.valid, samples.counts, jnp.inf),
         detector=jnp.where(samples.valid, samples.detector, 7),
     )
-    for a, b in zip(jax.tree.leaves(aggregate(samples, 4)), jax.tree.leaves(aggregate(spoilt, 4)), strict=True):
+    for a, b in zip(jax.tree.leaves(_aggregate(samples, 4)), jax.tree.leaves(_aggregate(spoilt, 4)), strict=True):
         np.testing.assert_array_equal(a, b)
 
 

@@ -1,5 +1,6 @@
 """Rovers and sites for the tests of the skid-steer physics, and the same rover in MuJoCo C."""
 
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -18,6 +19,7 @@ FILE = Path(__file__).parents[2] / "configs" / "vehicles" / "orpheus.yaml"
 SPEC = SkidSteer(**yaml.safe_load(FILE.read_text()))
 PARAMS = skid_steer_params(SPEC)
 DT = 0.005
+CHUNK = 10  # steps
 STEP = {engine: make_skid_steer_step(SPEC, engine, DT) for engine in ("mjx", "analytic")}
 ENGINES = tuple(STEP)
 
@@ -48,23 +50,27 @@ def plane_site(slope=(0.0, 0.0), wall_east_m=None, cells=80, cell=1.0) -> Site:
     )
 
 
-def _drive(engine, params, state, commands, site):
-    def one(state, command):
+@partial(jax.jit, static_argnums=0)
+def _chunk(engine, params, state, command, site):
+    def one(state, _):
         state = STEP[engine](params, state, command, site)
         return state, state
 
-    return jax.lax.scan(one, state, commands)[1]
-
-
-_DRIVE = jax.jit(_drive, static_argnums=0)
+    return jax.lax.scan(one, state, None, length=CHUNK)[1]
 
 
 def drive(engine, command, seconds, site=None, params=PARAMS, state=None, yaw=0.0):
-    """States [n, ...] after each step of driving ``command`` [4] (or [n, 4]) from rest at the origin."""
+    """States [n, ...] after each step of driving ``command`` [4] from rest at the origin, or from ``state``.
+
+    ``seconds`` is a multiple of 0.05: chunks of that length share one compilation.
+    """
     site = plane_site() if site is None else site
     state = rest_state(params, site, jnp.zeros(2), yaw) if state is None else state
-    commands = jnp.broadcast_to(jnp.asarray(command, jnp.float32), (round(seconds / DT), 4))
-    return _DRIVE(engine, params, state, commands, site)
+    chunks = []
+    for _ in range(round(seconds / DT) // CHUNK):
+        chunks.append(_chunk(engine, params, state, jnp.asarray(command, jnp.float32), site))
+        state = last(chunks[-1])
+    return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *chunks)
 
 
 def last(states):
@@ -73,7 +79,7 @@ def last(states):
 
 
 def mujoco_drive(command, seconds, dt, gravity=(0.0, 0.0, -9.81)):
-    """MuJoCo C's data after driving ``command`` [4] from rest on level ground with the motors' and tyres' laws in float64."""
+    """MuJoCo C's data after driving ``command`` [4] from rest on level ground, all in float64."""
     model = mujoco.MjModel.from_xml_string(skid_steer_mjcf(SPEC, time_step_s=dt))
     model.opt.gravity[:] = gravity
     data = mujoco.MjData(model)

@@ -6,13 +6,13 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
-from tests.physics.rovers import DT, PARAMS, SPEC, drive, last, mujoco_drive
 
 from swarmsim.physics import wheel_contact
 from swarmsim.physics.rotations import from_rotation_vector, yaw_of
 from swarmsim.physics.wheels import rotation_matrix
 from swarmsim.vehicles.rover_body import rover_body
 from swarmsim.vehicles.skid_steer import skid_steer_mjcf, wheel_inverse_mass
+from tests.physics.rovers import DT, PARAMS, SPEC, drive, last, mujoco_drive
 
 COMMANDS = {
     "straight": (5.0, 5.0, 5.0, 5.0),
@@ -57,7 +57,7 @@ def test_the_mjcf_weighs_what_the_body_does():
         wheel_inverse_mass(SPEC, body), rel=1e-6
     )
     full = np.zeros((10, 10))
-    mujoco.mj_fullM(model, full, data.qM)
+    mujoco.mj_fullM(model, data, full)
     np.testing.assert_allclose(full, wheel_contact.mass_matrix(PARAMS), atol=1e-4)
 
 
@@ -98,17 +98,16 @@ def test_accelerations_are_those_of_mujoco_on_the_same_mjcf(seed):
 def test_a_whole_mjx_step_gives_the_same_speeds():
     qpos, qvel, torque = random_state(7)
     model = mujoco.MjModel.from_xml_string(skid_steer_mjcf(SPEC, time_step_s=DT))
-    model.opt.iterations, model.opt.ls_iterations = 4, 6
+    model.opt.iterations, model.opt.ls_iterations = 30, 30
     device = mjx.put_model(model)
     data = mjx.make_data(model).replace(
         qpos=jnp.asarray(qpos, jnp.float32), qvel=jnp.asarray(qvel, jnp.float32), ctrl=jnp.asarray(torque, jnp.float32)
     )
     after = jax.jit(mjx.step)(device, data)
     exact = mujoco.MjData(model)
-    model.opt.iterations = 100
     exact.qpos[:], exact.qvel[:], exact.ctrl[:] = qpos, qvel, torque
     mujoco.mj_step(model, exact)
-    np.testing.assert_allclose(after.qvel, exact.qvel, atol=0.02)
+    np.testing.assert_allclose(after.qvel, exact.qvel, atol=5e-3)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

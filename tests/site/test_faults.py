@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from rasterio.transform import Affine
-from sites import MATERIALS, ground_plate, spec, yard
-from test_import import TO_Y_UP, write_tiff
+from yards import MATERIALS, TO_Y_UP, ground_plate, spec, write_tiff, yard
 
 from swarmsim.config.errors import InputError
 from swarmsim.site import ImportOptions, import_site, load_site

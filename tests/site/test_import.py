@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-import rasterio
 import trimesh
-from rasterio.transform import Affine
 from scipy.ndimage import map_coordinates
-from sites import MATERIALS, block, ground_plate, spec, yard
+from yards import MATERIALS, TO_X_UP, TO_Y_UP, block, ground_plate, prism, ring, spec, write_tiff, yard
 
 from swarmsim.config.errors import InputError
 from swarmsim.site import ImportOptions, import_site, load_site
@@ -14,9 +12,6 @@ from swarmsim.site.collada import write_collada
 from swarmsim.site.importer import build
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.raster import Grid, edges_on, faces_on, highest
-
-TO_Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
-TO_X_UP = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
 
 
 def built(tmp_path, scene, name="yard.glb", turn=None, scale=1.0, **fields):
@@ -112,8 +107,7 @@ def test_one_fused_surface_is_told_apart(tmp_path):
 
 
 def test_open_ring_becomes_four_walls(tmp_path):
-    outer, inner = trimesh.creation.box((10, 8, 2)), trimesh.creation.box((9.6, 7.6, 3))
-    pen = trimesh.boolean.difference([outer, inner]).apply_translation((2, 1, 1))
+    pen = ring((10, 8, 2), 0.2).apply_translation((2, 1, 0))
     scene = trimesh.Scene()
     scene.add_geometry(ground_plate(), geom_name="plate")
     scene.add_geometry(pen, geom_name="pen")
@@ -126,8 +120,7 @@ def test_open_ring_becomes_four_walls(tmp_path):
 def test_l_shape_is_split_and_tiny_things_only_count_in_the_rasters(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(ground_plate(), geom_name="plate")
-    wings = [block((12, 4, 3), (0, 0, 1.5)), block((4, 8, 3), (-4, 6, 1.5))]
-    building = trimesh.boolean.union(wings)
+    building = prism([[-6, -2], [6, -2], [6, 2], [-2, 2], [-2, 10], [-6, 10]], 3.0)
     scene.add_geometry(building, geom_name="building")
     scene.add_geometry(block((0.4, 0.4, 0.25), (12, -10, 0.125)), geom_name="brick")
     raw = built(tmp_path, scene)
@@ -204,13 +197,6 @@ def test_round_outline_is_outside_and_surveyed_within(tmp_path):
     assert raw.clearance[0, 0] < 0.0
 
 
-def write_tiff(path, rows, cell=5.0, **more):
-    profile = {"driver": "GTiff", "height": rows.shape[-2], "width": rows.shape[-1], "count": 1, "dtype": rows.dtype}
-    profile |= {"crs": "EPSG:32632", "transform": Affine(cell, 0.0, 500_000.0, 0.0, -cell, 5_200_000.0)} | more
-    with rasterio.open(path, "w", **profile) as file:
-        file.write(rows if rows.ndim == 3 else rows[None])
-
-
 def test_geotiff_rows_run_north_to_south(tmp_path):
     """Height grows to the north and east; row 0 of the file is the north edge."""
     north = np.linspace(20.0, 0.0, 41)[:, None]
@@ -259,10 +245,11 @@ def test_import_site_writes_all_or_nothing(tmp_path):
         import_site(tmp_path / "yard.glb", out, options, MATERIALS)
     import_site(tmp_path / "yard.glb", out, ImportOptions(overwrite=True, preview=False), MATERIALS)
     assert not (out / "preview.png").exists()
-    with pytest.raises(InputError, match="matches 'lawn'"):
+    with pytest.raises(InputError, match=r"^\S*yard.glb ground: .*matches 'lawn'") as caught:
         import_site(
             tmp_path / "yard.glb", tmp_path / "sites" / "other", ImportOptions(fields={"ground": ["lawn"]}), MATERIALS
         )
+    assert caught.value.problems[0].file == str(tmp_path / "yard.glb")
     assert [p.name for p in (tmp_path / "sites").iterdir()] == ["my_yard"]
 
 

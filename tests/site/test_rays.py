@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sites import MATERIALS, make_site
+from yards import MATERIALS, make_site
 
 from swarmsim.site import path_lengths
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from sites import spec
+from yards import spec
 
 from swarmsim.site.ground import named_ground
 from swarmsim.site.importer import build

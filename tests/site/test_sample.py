@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sites import make_site
+from yards import make_site
 
 from swarmsim.site import sample, sample_with_gradient
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import ndimage
-from sites import MATERIALS
+from yards import MATERIALS
 
+from swarmsim import site as sites
 from swarmsim.config.files import find
 from swarmsim.config.load import load_named
-from swarmsim import site as sites
 from swarmsim.site import load_site, sample, works_yard
 from swarmsim.site.importer import build
 
@@ -60,8 +60,7 @@ def test_area_relief_and_buildings(model):
 
 def test_free_air_at_20_m(model):
     site = model.site
-    assert float(jnp.max(site.surface_m - site.terrain_m)) < 14.0
-    assert float(jnp.max(site.surface_m)) < 20.0 - 5.0 + float(jnp.min(site.terrain_m)) + 5.0
+    assert float(jnp.max(site.surface_m - site.terrain_m)) < 20.0 - 5.0  # the obstacle clearance of the missions
 
 
 def test_rover_reaches_the_container_from_its_start_and_drives_around_it(model):

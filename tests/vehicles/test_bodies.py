@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from tests.vehicles.skid_steer_files import ROVER
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import BodyFile
 from swarmsim.vehicles.bodies import read_body, read_rover_body
+from tests.vehicles.skid_steer_files import ROVER
 
 
 def written(folder, text=ROVER, name="rover.urdf.xacro", **args) -> BodyFile:
@@ -83,7 +83,7 @@ def test_a_body_without_mass_is_refused(tmp_path):
 
 
 def test_a_missing_file_is_named():
-    with pytest.raises(InputError, match="there is no body file /nowhere/rover.urdf"):
+    with pytest.raises(InputError, match=r"there is no body file /nowhere/rover\.urdf"):
         read_body(BodyFile(file="/nowhere/rover.urdf"))
 
 

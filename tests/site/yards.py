@@ -2,12 +2,17 @@
 
 import jax.numpy as jnp
 import numpy as np
+import rasterio
 import trimesh
+from rasterio.transform import Affine
 
 from swarmsim.config.site import SiteSpec
 from swarmsim.site import Obstacles, Site
+from swarmsim.site.shapes import polygon_prism
 
 MATERIALS = ("air", "brick", "concrete", "soil", "steel", "vegetation", "wood")
+TO_Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
+TO_X_UP = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)
 
 
 def make_site(boxes=(), terrain=None, cell=100.0, origin=(-300.0, -300.0), materials=MATERIALS):
@@ -68,3 +73,29 @@ def yard(slope=0.0) -> trimesh.Scene:
     scene.add_geometry(block((8, 6, 5), (5, 3, 2.5), 0.3), geom_name="house")
     scene.add_geometry(block((0.4, 0.4, 3), (-10, -5, 1.5)), geom_name="post")
     return scene
+
+
+def prism(outline, height) -> trimesh.Trimesh:
+    """A solid over a polygon."""
+    return trimesh.Trimesh(**trimesh.triangles.to_kwargs(polygon_prism(np.array(outline, float), 0.0, height)))
+
+
+def ring(size, wall) -> trimesh.Trimesh:
+    """Four walls without floor or roof, one closed solid."""
+    square = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    outer, inner = square * size[:2], square * (np.array(size[:2]) - 2 * wall)
+    corners = np.concatenate([np.column_stack([xy, np.full(4, z)]) for xy in (outer, inner) for z in (0.0, size[2])])
+    loops = [(0, 4), (4, 12), (12, 8), (8, 0)]  # outside, top, inside, bottom
+    faces = []
+    for low, high in loops:
+        for k in range(4):
+            n = (k + 1) % 4
+            faces += [[low + k, low + n, high + n], [low + k, high + n, high + k]]
+    return trimesh.Trimesh(corners, faces, process=False)
+
+
+def write_tiff(path, rows, cell=5.0, **more):
+    profile = {"driver": "GTiff", "height": rows.shape[-2], "width": rows.shape[-1], "count": 1, "dtype": rows.dtype}
+    profile |= {"crs": "EPSG:32632", "transform": Affine(cell, 0.0, 500_000.0, 0.0, -cell, 5_200_000.0)} | more
+    with rasterio.open(path, "w", **profile) as file:
+        file.write(rows if rows.ndim == 3 else rows[None])

@@ -1,0 +1,208 @@
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest
+
+from swarmsim.estimation import (
+    concatenate,
+    cramer_rao_covariance,
+    detected,
+    extract_hotspots,
+    fisher_information,
+    initial_points,
+    interpolate,
+    localise,
+    net_rates,
+)
+from tests.estimation.survey import (
+    NUCLIDE,
+    detector,
+    draw,
+    mapping,
+    mean_rates,
+    orbit,
+    place,
+    settings,
+    survey,
+)
+
+SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
+QUICK = settings(iterations=120, fisher_steps=4)
+MAP = mapping(variance_kept=0.9, cell_m=5.0, length_scale_m=14.0)
+STARTS = jnp.array([[5.0, 8.0], [20.0, -2.0]])
+_localise = jax.jit(localise)
+
+
+def test_aerial_estimate_reaches_the_cramer_rao_bound_and_knows_its_error():
+    """256 seeds, physical detector, 924 one-second counts, through map, hotspots and likelihood as in a mission."""
+    site, d, flight = place(), (detector(),), survey()
+    rates = mean_rates(site, d, flight, [(SOURCE, ACTIVITY)])
+    information = jax.jit(fisher_information)(site, d, flight, SOURCE, ACTIVITY, NUCLIDE)
+    bound = np.sqrt(np.diag(cramer_rao_covariance(information, QUICK.height_std_m)))
+
+    def mission(key):
+        m = draw(flight, rates, key)
+        spots = extract_hotspots(MAP, interpolate(MAP, m))
+        return localise(site, d, m, initial_points(MAP, spots, 2), NUCLIDE, QUICK)
+
+    keys = jax.random.split(jax.random.key(11), 256)
+    fits = jax.jit(lambda k: jax.lax.map(mission, k, batch_size=16))(keys)
+    error = np.asarray(fits.position_m - SOURCE)[:, :2]
+    rmse = np.sqrt(np.mean(error**2, axis=0))
+    assert np.all(rmse <= 1.3 * bound[:2])
+    assert np.all(rmse >= 0.85 * bound[:2])  # nobody beats the bound: the errors would be wrong
+    assert np.all(np.abs(error.mean(axis=0)) < 4.0 * bound[:2] / 16.0)
+    assert np.mean(fits.converged) > 0.98
+    covariance = np.asarray(fits.covariance_m2)[:, :2, :2]
+    normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+    assert kstest(normalised, chi2(2).cdf).pvalue > 1e-3
+    log_error = np.log(np.asarray(fits.activity_bq) / ACTIVITY)
+    assert np.std(log_error) < 1.3 * bound[3]
+    assert bool(jnp.all(detected(fits, 5.0)))
+
+
+def test_ideal_detector_reaches_its_bound_too():
+    site, d, flight = place(), (detector("paper_ideal"),), survey(count=462)
+    rates = mean_rates(site, d, flight, [(SOURCE, ACTIVITY)])
+    information = jax.jit(fisher_information)(site, d, flight, SOURCE, ACTIVITY, NUCLIDE)
+    bound = np.sqrt(np.diag(cramer_rao_covariance(information, QUICK.height_std_m)))
+    keys = jax.random.split(jax.random.key(12), 64)
+    fits = jax.jit(
+        lambda k: jax.lax.map(
+            lambda q: localise(site, d, draw(flight, rates, q), STARTS, NUCLIDE, QUICK), k, batch_size=16
+        )
+    )(keys)
+    rmse = np.sqrt(np.mean(np.asarray(fits.position_m - SOURCE) ** 2, axis=0))
+    assert np.all(rmse[:2] < 1.3 * bound[:2])
+
+
+def test_without_a_source_nothing_is_detected():
+    site, d, flight = place(), (detector(),), survey(count=231)
+    rates = mean_rates(site, d, flight)
+    keys = jax.random.split(jax.random.key(13), 64)
+
+    def mission(key):
+        m = draw(flight, rates, key)
+        starts = initial_points(MAP, extract_hotspots(MAP, interpolate(MAP, m)), 2)
+        return localise(site, d, m, starts, NUCLIDE, QUICK)
+
+    fits = jax.jit(lambda k: jax.lax.map(mission, k, batch_size=16))(keys)
+    assert not bool(jnp.any(detected(fits, 5.0)))
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(fits))
+    # What little activity is fitted is within its own uncertainty, and the place is as unknown as the site is large.
+    assert float(jnp.median(fits.detection)) < 9.0
+    assert float(jnp.median(jnp.sqrt(fits.covariance_m2[:, 0, 0]))) > 4.0
+
+
+def noiseless(site, detectors, measurements, sources):
+    return replace(measurements, counts=mean_rates(site, detectors, measurements, sources) * measurements.exposure_s)
+
+
+def test_expected_counts_give_the_truth_back():
+    site, d = place(slope=(0.05, -0.1)), (detector(),)
+    truth = jnp.array([12.0, 4.0, 12.0 * 0.05 - 4.0 * 0.1 + 1.0])
+    m = noiseless(site, d, survey(count=300, slope=(0.05, -0.1)), [(truth, ACTIVITY)])
+    fit = _localise(site, d, m, STARTS, NUCLIDE, settings())
+    np.testing.assert_allclose(fit.position_m, truth, atol=0.03)
+    np.testing.assert_allclose(fit.activity_bq, ACTIVITY, rtol=0.01)
+    np.testing.assert_allclose(fit.background_scale, 1.0, rtol=0.003)
+    assert bool(fit.converged)
+    assert abs(float(fit.log_likelihood)) < 0.05
+
+
+def test_a_known_height_stays_fixed():
+    m = noiseless(place(), (detector(),), survey(count=300), [(SOURCE, ACTIVITY)])
+    fit = _localise(place(), (detector(),), m, STARTS, NUCLIDE, settings(height=0.5, height_std=0.0))
+    np.testing.assert_allclose(fit.position_m[2], 0.5, atol=0.01)
+    assert float(fit.covariance_m2[2, 2]) < 1e-5
+
+
+def test_a_source_behind_a_wall_is_found_where_it_is():
+    wall = [((9.0, 4.0, 2.0), (0.3, 6.0, 2.0), "concrete"), ((12.0, 8.5, 1.5), (3.0, 0.3, 1.5), "concrete")]
+    site, d = place(wall), (detector(), detector(model="nai_2x2"))
+    drive = orbit((12.0, 4.0), 7.0, 60)
+    m = concatenate(survey(count=300), drive)
+    rates = mean_rates(site, d, m, [(SOURCE, ACTIVITY)])
+    keys = jax.random.split(jax.random.key(14), 8)
+    fits = jax.jit(jax.vmap(lambda k: localise(site, d, draw(m, rates, k), STARTS, NUCLIDE, QUICK)))(keys)
+    error = np.linalg.norm(np.asarray(fits.position_m - SOURCE)[:, :2], axis=1)
+    assert error.max() < 0.5
+    # A model blind to the walls puts it elsewhere: the walls are what is tested.
+    blind = _localise(place(), d, draw(m, rates, 3), STARTS, NUCLIDE, QUICK)
+    assert float(blind.log_likelihood) < float(jnp.min(fits.log_likelihood)) - 50.0
+
+
+def test_ground_data_sharpen_the_aerial_estimate():
+    site, d = place(), (detector(), detector(model="nai_2x2"))
+    m = concatenate(survey(count=300), orbit((12.0, 4.0), 5.0, 60))
+    m = noiseless(site, d, m, [(SOURCE, ACTIVITY)])
+    both = _localise(site, d, m, STARTS, NUCLIDE, QUICK)
+    aerial = _localise(site, d, replace(m, valid=m.detector == 0), STARTS, NUCLIDE, QUICK)
+    assert float(both.covariance_m2[0, 0]) < 0.05 * float(aerial.covariance_m2[0, 0])
+    np.testing.assert_allclose(both.position_m, SOURCE, atol=0.02)
+    np.testing.assert_allclose(both.activity_bq, ACTIVITY, rtol=0.01)
+
+
+def test_two_sources_one_after_the_other():
+    site, d, flight = place(), (detector(),), survey(altitude=12.0, count=600)
+    truth = [(jnp.array([30.0, -25.0, 1.0]), 300e6), (jnp.array([-30.0, 20.0, 1.0]), 150e6)]
+    m = draw(flight, mean_rates(site, d, flight, truth), 7)
+    first = jnp.array([[28.0, -22.0]])
+    second = jnp.array([[-27.0, 22.0]])
+    extra = jnp.zeros(600)
+    rates = jax.jit(partial(net_rates, site, d))
+    for _ in range(3):  # each in turn with the other's rate known: coordinate ascent of the joint likelihood
+        strong = _localise(site, d, m, first, NUCLIDE, QUICK, extra)
+        weak = _localise(site, d, m, second, NUCLIDE, QUICK, strong.activity_bq * rates(m, strong.position_m, NUCLIDE))
+        extra = weak.activity_bq * rates(m, weak.position_m, NUCLIDE)
+    for fit, (position, activity) in zip((strong, weak), truth, strict=True):
+        sigma = np.sqrt(np.diag(fit.covariance_m2))[:2]
+        assert np.all(np.abs(np.asarray(fit.position_m - position)[:2]) < 4.0 * sigma)
+        assert abs(float(fit.activity_bq) - activity) < 4.0 * float(fit.activity_std_bq)
+        assert bool(detected(fit, 5.0))
+
+
+def test_padding_and_repetition_change_nothing():
+    site, d, flight = place(), (detector(),), survey(count=300)
+    m = draw(flight, mean_rates(site, d, flight, [(SOURCE, ACTIVITY)]), 5)
+    padded = jax.tree.map(lambda a: jnp.concatenate([a, a[:84]]), m)
+    padded = replace(
+        padded,
+        valid=padded.valid.at[300:].set(False),
+        counts=padded.counts.at[300:].set(jnp.nan),
+        position_m=padded.position_m.at[300:].set(jnp.nan),
+        detector=padded.detector.at[300:].set(9),
+    )
+    one, again, other = (_localise(site, d, v, STARTS, NUCLIDE, QUICK) for v in (m, m, padded))
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_allclose(one.position_m, other.position_m, atol=0.02)
+    np.testing.assert_allclose(one.detection, other.detection, rtol=1e-3)
+
+
+def test_a_mission_of_a_batch_equals_itself_alone():
+    site, d, flight = place(), (detector(),), survey(count=300)
+    rates = mean_rates(site, d, flight, [(SOURCE, ACTIVITY)])
+    batch = jax.vmap(lambda k: draw(flight, rates, k))(jax.random.split(jax.random.key(6), 3))
+    together = jax.jit(jax.vmap(lambda m: localise(site, d, m, STARTS, NUCLIDE, QUICK)))(batch)
+    alone = _localise(site, d, jax.tree.map(lambda a: a[1], batch), STARTS, NUCLIDE, QUICK)
+    np.testing.assert_allclose(together.position_m[1], alone.position_m, atol=0.02)
+    np.testing.assert_allclose(together.activity_bq[1], alone.activity_bq, rtol=2e-3)
+
+
+@pytest.mark.parametrize("case", ["no samples", "no counts", "outside"])
+def test_useless_data_give_a_finite_answer_that_is_no_detection(case):
+    site, d, m = place(), (detector(),), survey(count=300)
+    m = {
+        "no samples": replace(m, valid=jnp.zeros(300, bool)),
+        "no counts": m,
+        "outside": draw(replace(m, position_m=m.position_m + jnp.array([900.0, 0.0, 0.0])), jnp.full(300, 94.0), 1),
+    }[case]
+    fit = _localise(site, d, m, STARTS, NUCLIDE, QUICK)
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(fit))
+    assert not bool(detected(fit, 5.0))
+    assert np.all(np.abs(np.asarray(fit.position_m)[:2]) <= 90.0)
