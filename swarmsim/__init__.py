@@ -12,7 +12,12 @@ importing swarmsim is quick.
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
+
+# XLA logs an error for every program that it loads from the compilation cache, though nothing is wrong: it compares
+# tuning preferences (prefer-no-gather) with the processor's features. Whoever wants its log sets the variable.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 if TYPE_CHECKING:
     from swarmsim.config.errors import InputError

@@ -105,9 +105,9 @@ def view(run: Path, *, web: bool = False) -> None:
     web
         Use the viewer in the browser instead of the desktop's.
     """
-    from swarmsim.cli_run import view_run
+    from swarmsim.playback.viewer import open_recording
 
-    view_run(run, web)
+    open_recording(run, web)
 
 
 @command

@@ -1,9 +1,6 @@
-"""What ``swarmsim run`` and ``swarmsim view`` do."""
+"""What ``swarmsim run`` does."""
 
 import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +9,6 @@ from rich.console import Console
 from rich.table import Table
 
 from swarmsim.config.errors import InputError
-from swarmsim.config.names import one_of
 
 RECORDING, SUMMARY, SCENARIO = "mission.rrd", "summary.json", "scenario.yaml"
 
@@ -57,43 +53,21 @@ def run_scenario(
             "the seeds of the batch grow too large", given=f"the last is {last_seed}", allowed="less than 2147483648"
         )
     folder = out if out is not None else Path("runs") / scenario.mission.name
+
+    from swarmsim.missions.out_folder import check_out
+
     check_out(folder, force)
 
     from swarmsim.missions.progress import RichProgress
     from swarmsim.missions.run import run
 
     with RichProgress(Console(stderr=True), missions) as progress:
-        # What check_out allowed may be replaced: an empty folder, or an earlier run with --force.
-        run(scenario, folder, missions, progress, force=force or folder.is_dir())
+        run(scenario, folder, missions, progress, force=force)
     console = Console()
     console.print(summary_table(read_summary(folder), scenario.mission.name, missions))
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
     if (folder / RECORDING).is_file():
         console.print(f"Watch:   swarmsim view {folder}", highlight=False, soft_wrap=True)
-
-
-def check_out(folder: Path, force: bool) -> None:
-    """Raise `InputError` unless ``folder`` is new, or holds the results of an earlier run and ``force`` is given."""
-    if folder.is_file():
-        raise InputError.of("there is a file where the results should go", path="--out", given=str(folder))
-    if folder.is_dir() and any(folder.iterdir()):
-        if not force:
-            raise InputError.of(
-                "there are results already",
-                path="--out",
-                given=str(folder),
-                suggestion="choose another folder with --out, or replace them with --force",
-            )
-        if not (folder / SUMMARY).is_file() or not (folder / SCENARIO).is_file():
-            raise InputError.of(
-                f"the folder holds something else than a run, and is not replaced (no {SUMMARY} and {SCENARIO} in it)",
-                path="--out",
-                given=str(folder),
-                suggestion="choose another folder with --out",
-            )
-    parent = next(p for p in folder.absolute().parents if p.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError.of("the results cannot be written there", path="--out", given=str(folder))
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
@@ -143,27 +117,3 @@ def value_text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
-
-
-def view_run(run: Path, web: bool) -> None:
-    """Open the recording of a run and wait until the viewer is closed."""
-    recording = run / RECORDING if run.is_dir() else run
-    if not run.exists():
-        runs = sorted(path.parent for path in Path("runs").glob(f"*/{RECORDING}"))
-        raise InputError.of(
-            "there is no such run",
-            given=str(run),
-            allowed=one_of(map(str, runs)) if runs else "the folder of a run; there is none in runs/ yet",
-        )
-    if not recording.is_file() or recording.suffix != ".rrd":
-        hint = "a batch of missions has no recording: run one of its seeds alone, with --seed"
-        raise InputError.of("holds no recording", file=str(run), allowed=f"a folder with {RECORDING}", suggestion=hint)
-    command = [sys.executable, "-m", "rerun", str(recording)]
-    if web:
-        command += ["--web-viewer", "--bind", "127.0.0.1"]
-    ended = subprocess.run(command, check=False)
-    if ended.returncode != 0:
-        raise InputError.of(
-            f"the Rerun viewer ended with exit code {ended.returncode}",
-            suggestion=None if web else "on a machine without a display, use --web",
-        )

@@ -190,7 +190,7 @@ def test_an_empty_folder_is_a_place_for_results(project: Path, fly: Callable[[Fl
     (project / "empty").mkdir()
     assert cli.main(["run", "recon", "--out", "empty"]) == 0
     assert cli.main(["run", "recon", "--out", "new"]) == 0
-    assert forced == [True, False]
+    assert forced == [False, False]
 
 
 def test_force_never_replaces_what_is_no_run(
@@ -264,7 +264,7 @@ def test_view_opens_the_recording(
         commands.append(command[1:])
         return types.SimpleNamespace(returncode=len(commands) - 3)
 
-    monkeypatch.setattr("swarmsim.cli_run.subprocess.run", started)
+    monkeypatch.setattr("swarmsim.playback.viewer.subprocess.run", started)
     assert cli.main(["view", "runs/recon"]) == 2
     assert "there is none in runs/ yet" in capsys.readouterr().err
     fly(write_results)

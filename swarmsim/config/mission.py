@@ -82,6 +82,7 @@ class Ground(Model):
     speed_m_s: float = Field(gt=0, le=5)
     standoff_m: Positive
     viewpoints: int = Field(ge=1, le=64)
+    laps: int = Field(default=1, ge=1, le=10)
     time_limit_s: Positive
     spectrum_radius_m: Positive
     confidence_min: Fraction

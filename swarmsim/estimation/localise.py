@@ -3,9 +3,10 @@
 Two stages, because rays through walls and terrain cost a hundred times what the rest of the likelihood does:
 
 1. Adam (optax) with a cosine-decayed step from several starts. The exact net rates r0, and the activity and the
-   background that fit them best, are computed at the start of each of `SEGMENTS` segments; within one,
+   background that fit them best, are computed at the start of each segment of `SPREAD_M`; within one,
    r = r0 d0² / d² with d the distance to the crystal, the only part that changes quickly. What is held (attenuation,
    build-up, direction) changes r by a few per cent over the few metres of a segment, and is exact again at the next.
+   The source is spread out at first, so that a start is not caught between windows close to the ground.
 2. From the best end point, by exact likelihood: damped Fisher scoring (Levenberg–Marquardt on the Poisson likelihood,
    Osborne 1992) in which every evaluation uses exact path lengths. It removes what the first stage left, and its
    fixed point is that of the exact likelihood.
@@ -35,7 +36,9 @@ from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector
 from swarmsim.site import Site, sample_with_gradient
 
-SEGMENTS = 6  # exact rates are computed this often in the first stage
+# The first stage computes exact rates once per entry. Each entry is the length in m over which the source is taken to be
+# spread: it turns 1/d² to 1/(d² + s²), without which a start outside the ring that a rover drove could not cross it.
+SPREAD_M = (6.0, 4.0, 2.0, 1.0, 0.0, 0.0)
 PROFILE_STEPS = 10  # Fisher steps for activity and background with the position held
 LOG_ACTIVITY = (0.0, 34.5)  # 1 Bq to 1e15 Bq
 LOG_SCALE = (-4.6, 4.6)  # 1 % to 100 times the nominal background
@@ -195,8 +198,8 @@ def _search(
     params: LocalisationParams,
 ) -> jax.Array:
     """First stage: theta [S, 5] at the end of Adam from each start."""
-    per_segment = -(-params.iterations // SEGMENTS)
-    optimiser = optax.adam(optax.cosine_decay_schedule(1.0, per_segment * SEGMENTS, alpha=1e-3))
+    per_segment = -(-params.iterations // len(SPREAD_M))
+    optimiser = optax.adam(optax.cosine_decay_schedule(1.0, per_segment * len(SPREAD_M), alpha=1e-3))
     height_rate = jnp.where(params.height_std_m > FIXED_STD_M, jnp.minimum(params.height_std_m, 1.0), 0.0)
     rate = params.learning_rate_m * jnp.concatenate([jnp.ones(2), height_rate[None], jnp.array(LOG_RATES)])
 
@@ -204,22 +207,23 @@ def _search(
     zero = jnp.zeros(initial_xy.shape[0])
     columns = (initial_xy[:, 0], initial_xy[:, 1], zero + problem.height_m, zero, zero + log_scale)
     theta = jnp.clip(jnp.stack(columns, axis=-1), low, high)
-    gradient = jax.vmap(jax.grad(_held_loss), (0, 0, 0, None))
+    gradient = jax.vmap(jax.grad(_held_loss), (0, 0, 0, None, None))
 
     Carry = tuple[jax.Array, optax.OptState]
 
-    def segment(carry: Carry, _: None) -> tuple[Carry, None]:
-        rates = jax.lax.map(lambda t: _exact_rates(problem, t), carry[0])
+    def segment(carry: Carry, spread: jax.Array) -> tuple[Carry, None]:
+        strength = jax.lax.map(lambda t: _strength(problem, t), carry[0])
+        rates = jax.vmap(lambda t, s: s / (_squared_distance(problem, t, t) + spread**2))(carry[0], strength)
         anchor = carry[0].at[:, 3:].set(jax.vmap(lambda r: _profile(problem, r, log_scale))(rates))
 
         def iteration(carry: Carry, _: None) -> tuple[Carry, None]:
             theta, memory = carry
-            update, memory = optimiser.update(gradient(theta, anchor, rates, problem), memory)
+            update, memory = optimiser.update(gradient(theta, anchor, strength, spread, problem), memory)
             return (jnp.clip(theta + rate * update, low, high), memory), None
 
         return jax.lax.scan(iteration, (anchor, carry[1]), None, length=per_segment)[0], None
 
-    return jax.lax.scan(segment, (theta, optimiser.init(theta)), None, length=SEGMENTS)[0][0]
+    return jax.lax.scan(segment, (theta, optimiser.init(theta)), jnp.array(SPREAD_M))[0][0]
 
 
 def _exact_rates(problem: FitProblem, theta: jax.Array) -> jax.Array:
@@ -228,15 +232,24 @@ def _exact_rates(problem: FitProblem, theta: jax.Array) -> jax.Array:
     return net_rates(problem.site, problem.detectors, problem.measurements, place, problem.nuclide)
 
 
-def _held_loss(theta: jax.Array, anchor: jax.Array, rates: jax.Array, problem: FitProblem) -> jax.Array:
-    """Negative log posterior [] with the net rates [n] at ``anchor`` [5] moved by the inverse square law alone."""
+def _strength(problem: FitProblem, theta: jax.Array) -> jax.Array:
+    """Net rate per becquerel times squared distance [n]: what changes slowly with the position."""
+    return _exact_rates(problem, theta) * _squared_distance(problem, theta, theta)
+
+
+def _squared_distance(problem: FitProblem, theta: jax.Array, anchor: jax.Array) -> jax.Array:
+    """Squared distance [n] in m² from ``theta`` to every crystal, on the tangent plane of the ground at ``anchor``."""
     ground, slope = sample_with_gradient(problem.site.terrain_m, problem.site, anchor[:2])
-    start = jnp.append(anchor[:2], ground + anchor[2])
     place = jnp.append(theta[:2], ground + slope @ (theta[:2] - anchor[:2]) + theta[2])
-    crystal = problem.measurements.position_m
-    then, now = (jnp.sum((crystal - p) ** 2, axis=-1) for p in (start, place))
-    held = rates * then / jnp.maximum(now, 1e-4)
-    return -_log_posterior(problem, theta, jnp.exp(theta[3]) * held)
+    return jnp.maximum(jnp.sum((problem.measurements.position_m - place) ** 2, axis=-1), 1e-4)
+
+
+def _held_loss(
+    theta: jax.Array, anchor: jax.Array, strength: jax.Array, spread: jax.Array, problem: FitProblem
+) -> jax.Array:
+    """Negative log posterior [] at ``theta`` [5] with the strength [n] of ``anchor`` [5] and a source spread over m."""
+    rates = strength / (_squared_distance(problem, theta, anchor) + spread**2)
+    return -_log_posterior(problem, theta, jnp.exp(theta[3]) * rates)
 
 
 def _log_posterior(problem: FitProblem, theta: jax.Array, net_cps: jax.Array) -> jax.Array:

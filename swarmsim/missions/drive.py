@@ -51,7 +51,15 @@ def carrot(
 
 
 def drive_tick(
-    params: SkidSteerParams, drive: Drive, guide: Guide, site: Site, *, step: Step, periods: int, substeps: int, dt: float
+    params: SkidSteerParams,
+    drive: Drive,
+    guide: Guide,
+    site: Site,
+    *,
+    step: Step,
+    periods: int,
+    substeps: int,
+    dt: float,
 ) -> Drive:
     """Drive for one tick of ``periods`` control periods, each of ``substeps`` physics steps of ``dt`` s."""
     moving = events.under_way(drive.event_time_s)
@@ -71,7 +79,13 @@ def drive_tick(
 
 
 def judge(
-    params: SkidSteerParams, before: Drive, after: Drive, path_end_m: jax.Array, remaining_m: jax.Array, site: Site, now_s: jax.Array
+    params: SkidSteerParams,
+    before: Drive,
+    after: Drive,
+    path_end_m: jax.Array,
+    remaining_m: jax.Array,
+    site: Site,
+    now_s: jax.Array,
 ) -> Drive:
     """The drive after a tick, with its events recorded; a rover that has ended its part stands where it was.
 

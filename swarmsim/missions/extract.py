@@ -20,6 +20,7 @@ from swarmsim.missions.record import (
     VehicleRecord,
 )
 from swarmsim.missions.rollout import Ground, MissionBatch, Simulation
+from swarmsim.missions.shape import shape_of
 
 NOTHING_FOUND = "no source above background"
 
@@ -37,7 +38,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         _vehicle(simulation, i, jax.tree.map(lambda x, u=u: x[:, u], aerial["log"]), aerial["flights"].event_time_s[u])
         for u, i in enumerate(simulation.roles.uavs)
     ]
-    happened = _events([m.name for m in members], aerial["flights"].event_time_s)
+    happened = _events([m.name for m in members], aerial["flights"].event_time_s, float(aerial["end_s"]))
     phases = [Phase("aerial survey", 0.0, float(aerial["end_s"]))]
     samples = [_samples(u, "aerial", aerial["measurements"], u) for u in range(len(members))]
     route = np.zeros((0, 3))
@@ -47,11 +48,13 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         vehicles.append(_vehicle(simulation, simulation.roles.rover, ground["log"], times))
         phases.append(Phase("ground search", float(aerial["end_s"]), float(ground["end_s"])))
         if found:
-            happened += _events([name], times[None])
+            happened += _events([name], times[None], float(ground["end_s"]))
             samples.append(_samples(len(members), "ground", ground["measurements"], None))
             route = ground["route"].points_m
     learned = ground["knowledge"] if batch.ground is not None and found else None
-    aerial_estimate = _estimate(simulation, aerial["knowledge"].fit, simulation.world.presumed_nuclide) if found else None
+    aerial_estimate = (
+        _estimate(simulation, aerial["knowledge"].fit, simulation.world.presumed_nuclide) if found else None
+    )
     estimate = _estimate(simulation, learned.fit, learned.nuclide) if learned is not None else aerial_estimate
     spectrum = _spectrum(simulation, learned) if learned is not None else None
     return MissionRecord(
@@ -95,14 +98,17 @@ def _vehicle(simulation: Simulation, index: int, log: Log, event_time_s: np.ndar
         energy_wh=energy,
         battery_fraction=np.clip(1.0 - energy / spec.battery.capacity_wh, 0.0, 1.0),
         crashed=crashed,
+        shape=shape_of(spec),
     )
 
 
-def _events(names: list[str], times_s: np.ndarray) -> list[Event]:
+def _events(names: list[str], times_s: np.ndarray, limit_s: float) -> list[Event]:
     found = []
     for name, times in zip(names, times_s, strict=True):
         if not np.isfinite(times).any():
-            found.append(Event(time_s=float("inf"), vehicle=name, kind="time_limit", detail="had not ended its path in time"))
+            found.append(
+                Event(time_s=limit_s, vehicle=name, kind="time_limit", detail="had not ended its path in time")
+            )
         for kind, time in zip(events.KINDS, times, strict=True):
             if np.isfinite(time):
                 found.append(Event(time_s=float(time), vehicle=name, kind=kind, detail=events.DESCRIPTIONS[kind]))
@@ -168,7 +174,12 @@ def _spectrum(simulation: Simulation, learned: Any) -> Spectrum:
         nuclide=names[index] if index >= 0 else "none",
         confidence=float(answer.confidence),
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
+        lines_kev=_lines(simulation, names[index]) if index >= 0 else np.zeros(0),
     )
+
+
+def _lines(simulation: Simulation, nuclide: str) -> np.ndarray:
+    return np.array([line.energy_kev for line in simulation.scenario.nuclides[nuclide].lines])
 
 
 def _truth(simulation: Simulation) -> tuple[TrueSource, ...]:

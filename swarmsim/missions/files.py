@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import shutil
 import tempfile
 import time
@@ -16,40 +15,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from swarmsim.config.errors import InputError
+from swarmsim.missions.out_folder import SCENARIO, SUMMARY, check_out
 from swarmsim.missions.record import MissionRecord
 from swarmsim.missions.summary import Timings, batch_row, batch_summary, summary
 from swarmsim.playback import figures
 from swarmsim.playback.recording import write_recording
 from swarmsim.site.model import SiteModel
 
-SCENARIO, SUMMARY, MISSIONS = "scenario.yaml", "summary.json", "missions.parquet"
+MISSIONS = "missions.parquet"
 MEASUREMENTS, TRAJECTORIES = "measurements.parquet", "trajectories.parquet"
 MAP, RECORDING, FIGURES = "radiation_map.npz", "mission.rrd", "figures"
 _FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x y z, body (forward left up) to world"
-
-
-def check_out(out: Path, force: bool) -> None:
-    """Raise `InputError` unless a run can be written to ``out``.
-
-    It can where there is nothing yet or an empty folder and, with ``force``, in place of an earlier run. A folder that
-    holds anything else is never replaced.
-    """
-    if out.is_symlink() or (out.exists() and not out.is_dir()):
-        raise InputError.of("there is something else than a folder where the results should go", given=str(out))
-    if out.is_dir() and any(out.iterdir()):
-        if not force:
-            hint = "choose another folder with --out, or replace them with --force"
-            raise InputError.of("there are results already", given=str(out), suggestion=hint)
-        if not ((out / SUMMARY).is_file() and (out / SCENARIO).is_file()):
-            raise InputError.of(
-                f"the folder holds something else than a run, and is not replaced (no {SUMMARY} and {SCENARIO} in it)",
-                given=str(out),
-                suggestion="choose another folder with --out",
-            )
-    parent = next(p for p in out.absolute().parents if p.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise InputError.of("the results cannot be written there", given=str(out))
 
 
 def write_run(

@@ -107,7 +107,9 @@ class Simulation:
         fly = self.stage("fly", self.dynamics.fly, (0, None, 0, 0, None))
         count = self.stage("count", knowledge.count_from_air, (0, None, 0))
         learn = self.stage(
-            "learn from the air", lambda world, counts: knowledge.learn_from_air(world, counts, per_window, starts), (None, 0)
+            "learn from the air",
+            lambda world, counts: knowledge.learn_from_air(world, counts, per_window, starts),
+            (None, 0),
         )
         paths = plan(self.world)
         flights = self.stage("take off", self.dynamics.ready_to_fly, (0, None))(mission_keys, self.world)
@@ -132,7 +134,9 @@ class Simulation:
         plan = self.stage("plan the route", self.dynamics.plan_route, (None, 0, 0))
         drive = self.stage("drive", self.dynamics.drive, (None, 0, 0, None))
         count = self.stage(
-            "count on the ground", lambda key, world, log: knowledge.count_on_ground(key, world, log, per_sample), (0, None, 0)
+            "count on the ground",
+            lambda key, world, log: knowledge.count_on_ground(key, world, log, per_sample),
+            (0, None, 0),
         )
         learn = self.stage(
             "learn from the ground",

@@ -11,6 +11,7 @@ from swarmsim.config.geometry import check_geometry
 from swarmsim.config.scenario import Scenario
 from swarmsim.missions.extract import mission_record
 from swarmsim.missions.files import write_run
+from swarmsim.missions.out_folder import check_out
 from swarmsim.missions.progress import Progress, SilentProgress
 from swarmsim.missions.record import MissionRecord
 from swarmsim.missions.rollout import MissionBatch, Simulation
@@ -45,6 +46,7 @@ def run(
     Raises `InputError` for a scenario that cannot be flown, and where ``out`` exists and ``force`` is not given.
     """
     tell = progress or SilentProgress()
+    check_out(out, force)
     tell.phase("load the site", 0.0)
     simulation = build(scenario)
     batch = simulation.rollout(range(scenario.mission.seed, scenario.mission.seed + missions), tell)

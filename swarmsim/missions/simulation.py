@@ -107,7 +107,16 @@ class Dynamics:
         team, timing, site = world.team, self.timing, world.site
         gust_keys = keys.per_tick(keys.consumer(key, "gusts"), ticks, team.home_m.shape[0])
 
-        def one(traffic: Traffic, now: jax.Array, params: Any, limits: Any, flight: Flight, guided: Any, length: Any, gust_key: Any) -> Flight:
+        def one(
+            traffic: Traffic,
+            now: jax.Array,
+            params: Any,
+            limits: Any,
+            flight: Flight,
+            guided: Any,
+            length: Any,
+            gust_key: Any,
+        ) -> Flight:
             flown = flying.fly_tick(
                 params, flight, guide_of(guided, traffic), world.air, site, gust_key,
                 step=self.fly_step, periods=timing.uav_periods, substeps=timing.substeps, dt=timing.dt_s,
@@ -156,7 +165,9 @@ class Dynamics:
             target, limit, progress = driving.carrot(path, params.lookahead_m, progress, position, period)
             return *pursue(params, vehicle, target, limit), progress
 
-        return self._drive_guided(world, rover, ticks, self.timing.rover_periods, guide, path.length_m, path.points_m[-1])
+        return self._drive_guided(
+            world, rover, ticks, self.timing.rover_periods, guide, path.length_m, path.points_m[-1]
+        )
 
     def steer_rover(
         self, world: World, rover: Drive, ticks: jax.Array, speed_m_s: jax.Array, yaw_rate_rad_s: jax.Array

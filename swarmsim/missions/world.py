@@ -239,7 +239,9 @@ def _survey(scenario: Scenario, area: np.ndarray, roles: Roles) -> AerialTask:
     spacing = aerial.line_spacing_m or 0.5 * aerial.altitude_m
     homes = np.array([scenario.mission.vehicles[i].position_m for i in roles.uavs])
     lines = lines_needed(area, spacing, math.radians(aerial.sweep_deg))
-    limits = [spec.control.acceleration_max_m_s2 for i in roles.uavs if isinstance(spec := scenario.vehicles[i], Multirotor)]
+    limits = [
+        spec.control.acceleration_max_m_s2 for i in roles.uavs if isinstance(spec := scenario.vehicles[i], Multirotor)
+    ]
     return AerialTask(
         area_m=_f32(area),
         home_m=_f32(homes),
@@ -271,6 +273,7 @@ def _search(scenario: Scenario, site: Site, roles: Roles) -> GroundTask | None:
         acceleration_m_s2=_f32(0.5 * spec.control.acceleration_max_m_s2),
         rover_radius_m=_f32(0.5 * spec.chassis_size_m[1] + ROVER_MARGIN_M),
         viewpoints=ground.viewpoints,
+        laps=ground.laps,
         block=block,
         window=math.ceil(ROUTE_WINDOW_M / (block * float(site.cell_m))),
         points=ROUTE_POINTS,

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import Multirotor
 from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench
+from swarmsim.physics.mjx_import import mjx
 from swarmsim.physics.rigid_body import free_body_step, rotation_matrix, to_body, to_world
 from swarmsim.physics.rotations import from_yaw, multiply
 from swarmsim.pytree import pytree

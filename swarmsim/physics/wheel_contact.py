@@ -14,9 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from swarmsim.config.vehicles import SkidSteer
+from swarmsim.physics.mjx_import import mjx
 from swarmsim.vehicles.rover_body import RoverBody
 from swarmsim.vehicles.skid_steer import (
     FRICTION_RATIO,

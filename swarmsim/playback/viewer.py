@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from swarmsim.config.errors import InputError
+from swarmsim.config.names import one_of
 
 RECORDING = "mission.rrd"
 
@@ -12,9 +13,9 @@ RECORDING = "mission.rrd"
 def recording_of(run: Path) -> Path:
     """The recording of ``run``, which is a run's folder or a recording itself; `InputError` where there is none."""
     if not run.exists():
-        raise InputError.of(
-            "there is no such run", given=str(run), allowed=f"the folder of a run, with {RECORDING} in it"
-        )
+        runs = sorted(str(path.parent) for path in Path("runs").glob(f"*/{RECORDING}"))
+        allowed = one_of(runs) if runs else f"the folder of a run, with {RECORDING} in it; there is none in runs/ yet"
+        raise InputError.of("there is no such run", given=str(run), allowed=allowed)
     recording = run / RECORDING if run.is_dir() else run
     if not recording.is_file() or recording.suffix != ".rrd":
         raise InputError.of("holds no recording", file=run, allowed=f"a folder with {RECORDING}, or a .rrd file")

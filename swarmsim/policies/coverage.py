@@ -143,9 +143,7 @@ def _safe_height(task: AerialTask, site: Site, xy: jax.Array, spacing: jax.Array
     offsets = jnp.stack([jnp.cos(ring), jnp.sin(ring)], axis=-1)
     around = xy[:, None, None] + jnp.array([0.0, 0.5, 1.0])[:, None, None] * task.obstacle_clearance_m * offsets
     surface = jnp.max(sample(site.surface_m, site, around), axis=(1, 2))
-    wanted = jnp.maximum(
-        sample(site.terrain_m, site, xy) + task.altitude_m, surface + task.obstacle_clearance_m
-    )
+    wanted = jnp.maximum(sample(site.terrain_m, site, xy) + task.altitude_m, surface + task.obstacle_clearance_m)
     slope = CLIMB_GRADIENT * spacing * jnp.arange(len(wanted))
     ahead = jax.lax.cummax(wanted - slope, reverse=True) + slope
     behind = jax.lax.cummax(wanted + slope) - slope

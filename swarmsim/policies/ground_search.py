@@ -66,7 +66,7 @@ def _tour(
     target: jax.Array,
     cell: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """First viewpoint [2], the cells [n - 1, steps, 2] of the legs between viewpoints, and whether there is any.
+    """First viewpoint [2], the cells [n laps - 1, steps, 2] of the legs between viewpoints, and whether there is any.
 
     The legs are planned in a window round the target; a viewpoint that cannot be reached within it is left out.
     """
@@ -78,15 +78,17 @@ def _tour(
     within = jnp.clip(views - corner, 0, jnp.array(size) - 1)
     fields = jax.vmap(lambda goal: cost_to_go(local, goal, cell))(within)
     linked = reachable & jnp.isfinite(fields[first, within[:, 0], within[:, 1]])
-    # in their order round the target from the first one, those left out repeat the last that is not
+    # in their order round the target from the first one, as often as there are laps; then the last one repeats
     turn = jnp.where(linked, (jnp.arange(n) - first) % n, n)
-    order = jnp.argsort(turn)[jnp.minimum(jnp.arange(n), jnp.maximum(linked.sum() - 1, 0))]
+    visited = jnp.maximum(linked.sum(), 1)
+    number = jnp.minimum(jnp.arange(n * task.laps), visited * task.laps - 1)
+    order = jnp.argsort(turn)[number % visited]
     steps = sum(size)
 
     def leg(source: jax.Array, goal: jax.Array) -> jax.Array:
         return corner + descend(fields[goal], local, within[source], cell, steps)
 
-    legs = jax.vmap(leg)(order[:-1], order[1:]) if n > 1 else views[order][None]
+    legs = jax.vmap(leg)(order[:-1], order[1:]) if len(order) > 1 else views[order][None]
     return views[first], legs, jnp.any(reachable)
 
 

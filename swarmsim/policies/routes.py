@@ -35,9 +35,7 @@ def _neighbours(field: jax.Array, fill: float) -> jax.Array:
     """The field [ny, nx] as seen after each of the 16 moves [16, ny, nx]."""
     padded = jnp.pad(field, REACH, constant_values=fill)
     rows, columns = field.shape
-    return jnp.stack(
-        [padded[REACH + r : REACH + r + rows, REACH + c : REACH + c + columns] for r, c in MOVES.tolist()]
-    )
+    return jnp.stack([padded[REACH + r : REACH + r + rows, REACH + c : REACH + c + columns] for r, c in MOVES.tolist()])
 
 
 def cost_to_go(cost: jax.Array, goal: jax.Array, cell_m: jax.Array) -> jax.Array:

@@ -35,6 +35,7 @@ class GroundTask:
     acceleration_m_s2: jax.Array  # []
     rover_radius_m: jax.Array  # [] clearance that the rover needs
     viewpoints: int = static()  # places round the target to visit
+    laps: int = static()  # times round the target
     block: int = static()  # cells of the site's rasters along one edge of a planning cell
     window: int = static()  # planning cells that a route round the target may stray from it
     points: int = static()  # points of the path

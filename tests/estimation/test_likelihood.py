@@ -52,7 +52,6 @@ def test_net_rates_are_those_of_the_radiation_model_for_every_detector():
 
 
 def test_information_of_an_inverse_square_law_in_closed_form():
-    # The ideal detector sees side-on and end-on silhouettes; straight above at one height only 1/r^2 and the angle count.
     site, d = place(), (detector("paper_ideal"),)
     m = survey(count=300, lines=5)
     net = np.asarray(ACTIVITY * jax.jit(net_rates)(site, d, m, SOURCE, NUCLIDE), np.float64)
@@ -103,7 +102,7 @@ def test_score_has_zero_mean_and_the_information_as_covariance():
 
 
 def test_the_reference_floor_of_the_published_survey():
-    """reference: 0.55 m (ideal) and 1.42 m (physical, uncollided) per axis; build-up adds counts to the physical one."""
+    """0.55 m (ideal) and 1.42 m (physical, uncollided) per axis; build-up adds counts to the physical one."""
     bounds = {}
     for kind in ("paper_ideal", "physical"):
         information = _information(place(), (detector(kind),), survey(), SOURCE, ACTIVITY, NUCLIDE)

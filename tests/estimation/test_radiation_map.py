@@ -69,7 +69,7 @@ def test_far_from_samples_the_map_is_background_with_the_prior_spread():
     result = _interpolate(COARSE, draw(left, jnp.full(240, 94.0), 1))
     far, near = result.std_cps[:, -1], result.std_cps[2:-2, 2]
     assert float(jnp.min(far)) > 1.5 * float(jnp.max(near))
-    np.testing.assert_allclose(result.mean_cps[:, -1], result.background_cps, rtol=1e-3)
+    np.testing.assert_allclose(result.mean_cps[:, -1], result.background_cps, atol=0.1 * float(jnp.min(far)))
     np.testing.assert_array_equal(result.significance[:, -1], 0.0)
 
 

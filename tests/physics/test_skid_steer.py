@@ -96,11 +96,12 @@ def test_top_speed_is_the_commanded_one_less_rolling_resistance(engine):
 @pytest.mark.parametrize("engine", ENGINES)
 def test_brakes_no_harder_than_friction_and_torque_allow(engine):
     moving = last(drive(engine, np.full(4, 4.0), 2.0))
-    params = dataclasses.replace(PARAMS, torque_max_nm=jnp.float32(200.0), speed_gain_nm_s=jnp.float32(50.0))
+    params = dataclasses.replace(PARAMS, torque_max_nm=jnp.float32(34.0), speed_gain_nm_s=jnp.float32(50.0))
     states = drive(engine, np.zeros(4), 0.1, params=params, state=moving)
     speed = states.body.velocity_m_s[:, 0]
     slowing = float(speed[3] - speed[13]) / (10 * DT)
-    assert slowing == pytest.approx(SPEC.wheels.friction * G, rel=0.06)
+    limit = SPEC.wheels.friction * G
+    assert 0.7 * limit < slowing < 1.03 * limit
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.policies.sites import block_site
 
 from swarmsim.policies.coverage import lines_needed, parallel_lines, points_needed
 from swarmsim.policies.tasks import AerialTask
+from tests.policies.sites import block_site
 
 plan = jax.jit(parallel_lines)
 HOMES = ((-38.0, -20.0), (-38.0, 0.0), (-38.0, 20.0))
@@ -74,9 +74,7 @@ def test_parts_keep_apart():
 
 
 def test_terrain_is_followed_and_buildings_are_cleared():
-    site = block_site(
-        blocks=[(-5, -5, 5, 5)], height=24.0, terrain=lambda x, y: 3.0 * np.sin(x / 12.0) + 0.05 * y
-    )
+    site = block_site(blocks=[(-5, -5, 5, 5)], height=24.0, terrain=lambda x, y: 3.0 * np.sin(x / 12.0) + 0.05 * y)
     paths = plan(make_task(rectangle(36, 28)), site)
     points = np.asarray(paths.points_m).reshape(-1, 3)
     ground = 3.0 * np.sin(points[:, 0] / 12.0) + 0.05 * points[:, 1]

@@ -2,21 +2,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.policies.sites import block_site
 
 from swarmsim.policies.ground_search import approach_and_orbit
 from swarmsim.policies.routes import coarsen, cost_to_go, descend
 from swarmsim.policies.tasks import GroundTask
+from tests.policies.sites import block_site
 
 drive = jax.jit(approach_and_orbit)
 
 
-def make_task(start, target, standoff=4.0, viewpoints=8, radius=0.6):
+def make_task(start, target, standoff=4.0, viewpoints=8, radius=0.6, laps=1):
     values = {"standoff_m": standoff, "speed_m_s": 0.9, "acceleration_m_s2": 0.5, "rover_radius_m": radius}
     return GroundTask(
         start_m=jnp.array(start, jnp.float32),
         target_m=jnp.array(target, jnp.float32),
         viewpoints=viewpoints,
+        laps=laps,
         block=2,
         window=20,
         points=512,
@@ -76,6 +77,13 @@ def test_route_starts_at_the_rover_avoids_obstacles_and_goes_round_the_target(st
     near = points[np.linalg.norm(points - [10, 4], axis=1) < 7]
     angle = np.unwrap(np.arctan2(near[:, 1] - 4, near[:, 0] - 10))
     assert np.ptp(angle) > 1.5 * np.pi
+
+
+def test_second_lap_goes_round_again():
+    site = block_site([(7, 2.5, 13, 5.5)])
+    once, twice = (drive(make_task((-30.0, -20.0), (10.0, 4.0), laps=laps), site) for laps in (1, 2))
+    lap = float(twice.length_m - once.length_m)
+    assert 2 * np.pi * 3.5 < lap < 2 * np.pi * 6.5
 
 
 def test_unreachable_target_leaves_the_rover_where_it_is():

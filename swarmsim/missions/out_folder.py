@@ -1,0 +1,34 @@
+"""Where a run may be written."""
+
+import os
+from pathlib import Path
+
+from swarmsim.config.errors import InputError
+
+SCENARIO, SUMMARY = "scenario.yaml", "summary.json"
+
+
+def check_out(out: Path, force: bool) -> None:
+    """Raise `InputError` unless a run can be written to ``out``.
+
+    It can where there is nothing yet or an empty folder and, with ``force``, in place of an earlier run. A folder that
+    holds anything else is never replaced.
+    """
+    if out.is_symlink() or (out.exists() and not out.is_dir()):
+        raise InputError.of(
+            "there is something else than a folder where the results should go", path="--out", given=str(out)
+        )
+    if out.is_dir() and any(out.iterdir()):
+        if not force:
+            hint = "choose another folder with --out, or replace them with --force"
+            raise InputError.of("there are results already", path="--out", given=str(out), suggestion=hint)
+        if not ((out / SUMMARY).is_file() and (out / SCENARIO).is_file()):
+            raise InputError.of(
+                f"the folder holds something else than a run, and is not replaced (no {SUMMARY} and {SCENARIO} in it)",
+                path="--out",
+                given=str(out),
+                suggestion="choose another folder with --out",
+            )
+    parent = next(p for p in out.absolute().parents if p.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise InputError.of("the results cannot be written there", path="--out", given=str(out))
