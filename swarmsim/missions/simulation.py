@@ -20,7 +20,7 @@ from swarmsim.missions import flight as flying
 from swarmsim.missions.drive import Drive
 from swarmsim.missions.flight import Flight, Traffic
 from swarmsim.missions.measure import Log
-from swarmsim.missions.world import Roles, Timing, World
+from swarmsim.missions.world import Roles, Timing, World, embodied
 from swarmsim.physics import multirotor, skid_steer
 from swarmsim.physics.wind import gust_start
 from swarmsim.policies import get
@@ -42,7 +42,7 @@ class Dynamics:
         self.ground_policy = get("ground", mission.ground.policy)
         uav = scenario.vehicles[roles.uavs[0]]
         assert isinstance(uav, Multirotor)
-        self.fly_step = multirotor.make_multirotor_step(uav, mission.engine, timing.dt_s)
+        self.fly_step = multirotor.make_multirotor_step(embodied(uav), mission.engine, timing.dt_s)
         self.drive_step: skid_steer.Step | None = None
         if roles.rover is not None:
             rover = scenario.vehicles[roles.rover]

@@ -106,6 +106,15 @@ def roles_of(scenario: Scenario) -> Roles:
     return Roles(uavs=uavs, rover=rovers[0] if rovers else None)
 
 
+def embodied(spec: Multirotor) -> Multirotor:
+    """The specification with the mass and inertia of its body file, where it names one."""
+    if spec.body is None:
+        return spec
+    from swarmsim.vehicles.bodies import with_file_body  # its readers take half a second to import
+
+    return with_file_body(spec)
+
+
 def build_timing(scenario: Scenario, roles: Roles) -> Timing:
     """Periods of the scenario.
 
@@ -206,7 +215,7 @@ def _team(scenario: Scenario, library: Library, roles: Roles) -> Team:
     detectors = [_detector(scenario, i, library) for i in roles.uavs]
     limits = [[s.collision_radius_m, 0.5 * s.collision_height_m, s.impact_speed_max_m_s] for s in specs]
     return Team(
-        params=_stack([multirotor_params(s) for s in specs], "the same numbers of rotors and feet"),
+        params=_stack([multirotor_params(embodied(s)) for s in specs], "the same numbers of rotors and feet"),
         limits=_f32(limits),
         detector=_stack(detectors, "detectors of the same kind"),
         home_m=_f32([m.position_m for m in members]),
