@@ -1,0 +1,129 @@
+"""The mission on a small area: what it finds, what it records, and that a batch equals its missions one by one."""
+
+import json
+
+import jax
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import swarmsim
+from swarmsim.missions.files import MEASUREMENTS, MISSIONS, TRAJECTORIES
+from swarmsim.missions.rollout import Simulation
+
+# a quarter of the yard round the container, two UAVs, the rover close by
+SMALL = (
+    "engine=analytic",
+    "aerial.area_m=[[-6, -16], [30, -16], [30, 24], [-6, 24]]",
+    "aerial.speed_m_s=4",
+    "aerial.descent_speed_m_s=2",
+    "vehicles=[{name: uav1, type: tarot_t650, position_m: [20, -14]}, {name: uav2, type: tarot_t650, position_m: [22, 14]},"
+    " {name: orpheus, type: orpheus, position_m: [24, -10]}]",
+    "ground.laps=1",
+    "localisation.iterations=60",
+)
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    return swarmsim.build(swarmsim.load("recon", SMALL))
+
+
+@pytest.fixture(scope="module")
+def batch(simulation):
+    return simulation.rollout([5, 6])
+
+
+@pytest.fixture(scope="module")
+def records(simulation, batch):
+    return [swarmsim.mission_record(simulation, batch, index) for index in range(2)]
+
+
+def test_the_mission_finds_locates_and_names_the_source(records):
+    for record in records:
+        truth = record.sources[0]
+        assert not any(vehicle.crashed for vehicle in record.vehicles)
+        assert np.linalg.norm(record.map.hotspots_m[0] - truth.position_m[:2]) < 10.0
+        assert np.linalg.norm(record.estimate.position_m[:2] - truth.position_m[:2]) < 1.0
+        assert record.estimate.activity_mbq == pytest.approx(truth.activity_mbq, rel=0.15)
+        assert record.spectrum.nuclide == truth.nuclide
+        assert record.spectrum.confidence > 0.9
+        assert "Co-60" in record.finding
+
+
+def test_phases_follow_one_another_and_vehicles_end_at_rest(records):
+    for record in records:
+        survey, search = record.phases
+        assert survey.end_s == search.start_s < search.end_s
+        for vehicle in record.vehicles:
+            assert np.all(np.diff(vehicle.time_s) > 0)
+            assert np.linalg.norm(vehicle.velocity_m_s[-1]) < 0.3
+            assert np.all(np.diff(vehicle.energy_wh) >= 0)
+            np.testing.assert_allclose(np.linalg.norm(vehicle.quaternion, axis=1), 1.0, atol=1e-4)
+        assert {e.kind for e in record.events} == {"finished"}
+        assert np.all(np.diff(record.samples.time_s) >= 0)
+
+
+def test_uavs_fly_the_lines_at_the_height_above_ground(simulation, records):
+    from swarmsim.site import sample
+
+    site, task = simulation.world.site, simulation.world.survey
+    for vehicle in records[0].vehicles[:2]:
+        over = (vehicle.position_m[:, 0] > -4) & (vehicle.position_m[:, 0] < 14)
+        height = vehicle.position_m[over, 2] - np.asarray(sample(site.terrain_m, site, vehicle.position_m[over, :2]))
+        assert np.percentile(np.abs(height - 20.0), 90) < 0.6
+    assert float(task.line_spacing_m) == 10.0
+
+
+def test_mission_k_of_a_batch_is_the_mission_of_its_seed(simulation, batch, records):
+    alone = swarmsim.mission_record(simulation, simulation.rollout(6), 0)
+    together = records[1]
+    # single and batched programs round differently; contact and feedback keep the difference small, not zero
+    for one, other in zip(alone.vehicles, together.vehicles, strict=True):
+        count = min(len(one.time_s), len(other.time_s))
+        assert abs(len(one.time_s) - len(other.time_s)) <= 2
+        np.testing.assert_allclose(one.position_m[:count], other.position_m[:count], atol=0.05)
+    assert np.mean(alone.samples.counts != together.samples.counts) < 0.02
+    np.testing.assert_allclose(alone.estimate.position_m, together.estimate.position_m, atol=0.1)
+    assert alone.estimate.activity_mbq == pytest.approx(together.estimate.activity_mbq, rel=0.02)
+    assert alone.spectrum.nuclide == together.spectrum.nuclide
+
+
+def test_seeds_differ(records):
+    first, second = (record.samples.of_phase("aerial").counts for record in records)
+    count = min(len(first), len(second))
+    assert np.mean(first[:count] != second[:count]) > 0.5
+
+
+def test_no_activity_is_a_clear_finding(simulation):
+    world = simulation.world
+    silent = swarmsim.build(swarmsim.load("recon", (*SMALL, "sources.0.activity_mbq=0")))
+    assert jax.tree.structure(silent.world) == jax.tree.structure(world)
+    record = swarmsim.mission_record(silent, silent.rollout(1), 0)
+    assert record.finding == "no source above background"
+    assert record.estimate is None
+    assert record.spectrum is None
+    assert len(record.map.hotspots_m) == 0
+    assert len(record.samples.of_phase("ground").counts) == 0
+    rover = record.vehicles[-1]
+    assert np.ptp(rover.position_m[:, :2], axis=0).max() < 0.05
+
+
+def test_a_run_is_written_whole_and_flies_again(tmp_path):
+    scenario = swarmsim.load("recon", (*SMALL, "seed=5"))
+    swarmsim.run(scenario, tmp_path / "first", missions=2)
+    rows = pq.read_table(tmp_path / "first" / MISSIONS).to_pylist()
+    assert [row["seed"] for row in rows] == [5, 6]
+    assert all(row["success"] for row in rows)
+    for name in (MEASUREMENTS, TRAJECTORIES, "mission.rrd", "radiation_map.npz", "summary.json", "scenario.yaml"):
+        assert (tmp_path / "first" / name).stat().st_size > 0
+    again = swarmsim.load(tmp_path / "first" / "scenario.yaml")
+    (record,) = swarmsim.run(again, tmp_path / "second")
+    summary = json.loads((tmp_path / "second" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["source"]["position_m"] == pytest.approx(list(record.estimate.position_m), abs=1e-3)
+    assert summary["seed"] == 5
+    assert summary["real_time_factor"] > 0
+    assert rows[0]["source_activity_mbq"] == pytest.approx(summary["source"]["activity_mbq"], rel=0.02)
+    with pytest.raises(swarmsim.InputError, match="results already"):
+        swarmsim.run(again, tmp_path / "second")
+    assert {path.name for path in tmp_path.iterdir()} == {"first", "second"}
