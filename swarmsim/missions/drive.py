@@ -18,6 +18,7 @@ from swarmsim.vehicles.skid_steer import SkidSteerParams
 from swarmsim.vehicles.state import SkidSteerState
 
 ARRIVED_M = 0.2  # a rover this close to the end of its path, its reference being there, has arrived
+ARRIVED_SPEED_M_S = 0.1
 START_SPEED_M_S = 0.2  # a path starts at rest, a rover on it at this speed
 TILT_LIMIT_COSINE = 0.5  # a rover tilted by 60 degrees has tipped over
 
@@ -99,7 +100,8 @@ def judge(
     body = after.vehicle.body
     finite = jnp.all(jnp.isfinite(ravel_pytree(after.vehicle)[0]))
     near = jnp.linalg.norm(body.position_m[:2] - path_end_m[:2]) < ARRIVED_M
-    arrived = near & (remaining_m <= 0.0)
+    still = jnp.linalg.norm(body.velocity_m_s) < ARRIVED_SPEED_M_S
+    arrived = near & still & (remaining_m <= 0.0)
     upright = 1.0 - 2.0 * (body.quaternion[1] ** 2 + body.quaternion[2] ** 2)
     # the bumpers may have stopped the rover within the tick: a wall that it touches now was met at the speed before
     twist = replace(body, velocity_m_s=before.vehicle.body.velocity_m_s)
@@ -110,5 +112,5 @@ def judge(
     happened = happened.at[events.NON_FINITE].set(~finite)
     times = events.record(before.event_time_s, happened, now_s)
     ended = ~events.under_way(before.event_time_s) | ~finite
-    still = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, after)
-    return replace(still, event_time_s=times)
+    held = jax.tree.map(lambda old, new: jnp.where(ended, old, new), before, after)
+    return replace(held, event_time_s=times)

@@ -82,7 +82,7 @@ class Simulation:
         self.world: World = build_world(scenario, site_model, self.roles)
         self.dynamics = Dynamics(scenario, self.roles, self.timing)
         self.clock = Clock()
-        self._stages: dict[str, Stage] = {}
+        self._stages: dict[tuple[str, int | None], Stage] = {}
         self._per_window = max(1, round(scenario.mission.localisation.window_s / self.timing.uav_tick_s))
 
     @property
@@ -183,12 +183,12 @@ class Simulation:
     ) -> Stage:
         """The compiled batch form of a function of one mission: ``axes`` tells which arguments have the axis B.
 
-        The compiled function is kept under its name for the life of the simulation.
+        ``size`` is B where no argument has the axis. What is compiled is kept for the life of the simulation.
         """
-        if name not in self._stages:
+        if (name, size) not in self._stages:
             batched = jax.vmap(function, in_axes=axes, out_axes=out_axes, axis_size=size)
-            self._stages[name] = Stage(name, batched, self.clock)
-        return self._stages[name]
+            self._stages[name, size] = Stage(name, batched, self.clock)
+        return self._stages[name, size]
 
 
 def _end(event_time_s: jax.Array, log_time_s: jax.Array) -> jax.Array:

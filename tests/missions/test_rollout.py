@@ -43,7 +43,8 @@ def test_the_mission_finds_locates_and_names_the_source(records):
     for record in records:
         truth = record.sources[0]
         assert not any(vehicle.crashed for vehicle in record.vehicles)
-        assert np.linalg.norm(record.map.hotspots_m[0] - truth.position_m[:2]) < 10.0
+        # from 20 m up a source is a spot of 31 m full width at half maximum (1/r^2)
+        assert np.linalg.norm(record.map.hotspots_m[0] - truth.position_m[:2]) < 16.0
         assert np.linalg.norm(record.estimate.position_m[:2] - truth.position_m[:2]) < 1.0
         assert record.estimate.activity_mbq == pytest.approx(truth.activity_mbq, rel=0.15)
         assert record.spectrum.nuclide == truth.nuclide
