@@ -1,53 +1,37 @@
 """Maximum-likelihood localisation of one point source with the full forward model of the measurement.
 
-Two stages, because rays through walls and terrain cost a hundred times what the rest of the likelihood does:
-
-1. Adam (optax) with a cosine-decayed step from several starts. The exact net rates r0, and the activity and the
-   background that fit them best, are computed at the start of each segment of `SPREAD_M`; within one,
-   r = r0 d0² / d² with d the distance to the crystal, the only part that changes quickly. What is held (attenuation,
-   build-up, direction) changes r by a few per cent over the few metres of a segment, and is exact again at the next.
-   The source is spread out at first, so that a start is not caught between windows close to the ground.
-2. From the best end point, by exact likelihood: damped Fisher scoring (Levenberg–Marquardt on the Poisson likelihood,
-   Osborne 1992) in which every evaluation uses exact path lengths. It removes what the first stage left, and its
-   fixed point is that of the exact likelihood.
+A search from several starts (`swarmsim.estimation.search`) ends near the largest likelihood; damped Fisher scoring
+(Levenberg–Marquardt on the Poisson likelihood, Osborne 1992) goes the rest of the way. Every evaluation of the latter
+uses exact path lengths, so its fixed point and its covariance are those of the exact likelihood.
 """
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from swarmsim.config.mission import Localisation
 from swarmsim.estimation.likelihood import (
-    FIXED_STD_M,
     Evaluation,
     FitProblem,
     evaluate,
-    expected_counts,
-    height_precision,
-    net_rates,
-    observed_rates,
-    poisson_log_likelihood,
     position_covariance,
     position_of,
     scaled_inverse,
 )
 from swarmsim.estimation.measurements import Measurements, cleared
+from swarmsim.estimation.search import (
+    LOG_STEP,
+    Bounds,
+    background_only,
+    bounds,
+    gradient_search,
+    pattern_search,
+)
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector
-from swarmsim.site import Site, sample_with_gradient
+from swarmsim.site import Site
 
-# The first stage computes exact rates once per entry. Each entry is the length in m over which the source is taken to
-# be spread: it turns 1/d² to 1/(d² + s²), without which a start outside the ring that a rover drove could not cross it.
-SPREAD_M = (10.0, 5.0, 2.0, 0.0, 0.0, 0.0)
-PROFILE_STEPS = 10  # Fisher steps for activity and background with the position held
-LOG_ACTIVITY = (0.0, 34.5)  # 1 Bq to 1e15 Bq
-LOG_SCALE = (-4.6, 4.6)  # 1 % to 100 times the nominal background
-LOG_STEP = 1.0  # longest Fisher step of a logarithm
 POSITION_STEP_M = 10.0  # longest Fisher step of a coordinate
 SETTLED_NATS = 0.02  # gain of the last Fisher steps below which the fit has converged: 0.2 standard deviations
-HEIGHT_REACH = 4.0  # the height is sought within this many of its standard deviations
-# Adam moves every coordinate by about its rate per iteration: logarithms by these per metre of learning rate.
-LOG_RATES = (0.3, 0.1)
 
 
 @pytree
@@ -57,7 +41,9 @@ class LocalisationParams:
     presumed_height_m: jax.Array  # [] prior mean of the source's height above ground
     height_std_m: jax.Array  # [] its standard deviation; 0 = known
     learning_rate_m: jax.Array  # [] first step of Adam
+    search_radius_m: jax.Array  # [] reach of the first round of the pattern search
     iterations: int = static()  # of Adam
+    search_rounds: int = static()  # of the pattern search
     fisher_steps: int = static()  # of the polish
 
 
@@ -83,7 +69,9 @@ def localisation_params(spec: Localisation) -> LocalisationParams:
         presumed_height_m=jnp.float32(spec.presumed_height_m),
         height_std_m=jnp.float32(spec.height_std_m),
         learning_rate_m=jnp.float32(spec.learning_rate_m),
+        search_radius_m=jnp.float32(spec.search_radius_m),
         iterations=spec.iterations,
+        search_rounds=spec.search_rounds,
         fisher_steps=spec.fisher_steps,
     )
 
@@ -105,8 +93,8 @@ def localise(
         measurements: windows, about a second each.
         initial_xy: [S, 2] starting points, m, world ENU (`initial_points`).
         nuclide: [] int32 index in the library's order.
-        params: settings. extra_rate_cps: [] or [n] net rate of sources already known, to find several one after the
-        other (`net_rates`).
+        params: settings.
+        extra_rate_cps: [] or [n] net rate of sources known already (`net_rates`), to find several in turn.
 
     Returns:
         The fit. It always exists: ask `detected` whether there is a source at all.
@@ -122,11 +110,12 @@ def localise(
         height_m=params.presumed_height_m,
         height_std_m=params.height_std_m,
     )
-    bounds = _bounds(problem)
-    log_scale, background_only = _background_only(problem)
-    candidates = _search(problem, bounds, initial_xy, log_scale, params)
-    theta, found, settled = _polish(problem, bounds, _best(problem, candidates), params.fisher_steps)
-    return _report(problem, bounds, theta, found, settled, background_only)
+    limits = bounds(problem)
+    log_scale, without_source = background_only(problem)
+    candidates = gradient_search(problem, limits, initial_xy, log_scale, params.learning_rate_m, params.iterations)
+    best = pattern_search(problem, limits, candidates, log_scale, params.search_radius_m, params.search_rounds)
+    theta, found, settled = _polish(problem, limits, best, params.fisher_steps)
+    return _report(problem, limits, theta, found, settled, without_source)
 
 
 def detected(fit: SourceFit, significance_sigma: jax.Array | float) -> jax.Array:
@@ -140,135 +129,8 @@ def detected(fit: SourceFit, significance_sigma: jax.Array | float) -> jax.Array
     return fit.detection > jnp.square(significance_sigma)
 
 
-def _bounds(problem: FitProblem) -> tuple[jax.Array, jax.Array]:
-    """Lower and upper bounds [5] of theta."""
-    site = problem.site
-    ny, nx = site.terrain_m.shape
-    extent = site.cell_m * jnp.array([nx - 1, ny - 1], jnp.float32)
-    reach = HEIGHT_REACH * jnp.maximum(problem.height_std_m, FIXED_STD_M)
-
-    def limits(corner: jax.Array, height: jax.Array, end: int) -> jax.Array:
-        return jnp.concatenate([corner, height[None], jnp.array([LOG_ACTIVITY[end], LOG_SCALE[end]])])
-
-    return limits(site.origin_m, problem.height_m - reach, 0), limits(
-        site.origin_m + extent, problem.height_m + reach, 1
-    )
-
-
-def _background_only(problem: FitProblem) -> tuple[jax.Array, jax.Array]:
-    """Best log background scale [] without a source, and its log likelihood []."""
-    m = problem.measurements
-    none = jnp.zeros_like(m.counts)
-
-    def step(_: int, log_scale: jax.Array) -> jax.Array:
-        mean, slope = jax.jvp(lambda s: expected_counts(problem, none, s), (log_scale,), (jnp.ones_like(log_scale),))
-        mean = jnp.maximum(mean, 1e-6)
-        score = jnp.sum(jnp.where(m.valid, slope * (m.counts - mean) / mean, 0.0))
-        information = jnp.sum(jnp.where(m.valid, slope * slope / mean, 0.0))
-        return jnp.clip(log_scale + jnp.clip(score / jnp.maximum(information, 1e-12), -LOG_STEP, LOG_STEP), *LOG_SCALE)
-
-    log_scale = jax.lax.fori_loop(0, 2 * PROFILE_STEPS, step, jnp.zeros(()))
-    return log_scale, poisson_log_likelihood(m.counts, expected_counts(problem, none, log_scale), m.valid)
-
-
-def _profile(problem: FitProblem, rates: jax.Array, log_scale: jax.Array) -> jax.Array:
-    """Best log activity and log scale [2] at a held position with net rates ``rates`` [n] per becquerel."""
-    m = problem.measurements
-    # Start where the source gives as much as the background to the windows that see it best.
-    brightest = jnp.max(jnp.where(m.valid, rates, 0.0))
-    level = observed_rates(problem.detectors, m, jnp.zeros_like(rates), jnp.ones(()))
-    start = jnp.log(jnp.maximum(jnp.max(jnp.where(m.valid, level, 0.0)), 1.0) / jnp.maximum(brightest, 1e-20))
-
-    def step(_: int, v: jax.Array) -> jax.Array:
-        mean, jacobian = jax.jvp(lambda a: expected_counts(problem, jnp.exp(a) * rates, v[1]), (v[0],), (jnp.ones(()),))
-        _, by_scale = jax.jvp(lambda s: expected_counts(problem, jnp.exp(v[0]) * rates, s), (v[1],), (jnp.ones(()),))
-        mean = jnp.maximum(mean, 1e-6)
-        j = jnp.where(m.valid, jnp.stack([jacobian, by_scale]), 0.0)
-        f = (j / mean) @ j.T
-        delta = scaled_inverse(f) @ (j @ ((m.counts - mean) / mean))
-        return jnp.clip(v + jnp.clip(delta, -LOG_STEP, LOG_STEP), *jnp.array([LOG_ACTIVITY, LOG_SCALE]).T)
-
-    return jax.lax.fori_loop(0, PROFILE_STEPS, step, jnp.stack([jnp.clip(start, *LOG_ACTIVITY), log_scale]))
-
-
-def _search(
-    problem: FitProblem,
-    bounds: tuple[jax.Array, jax.Array],
-    initial_xy: jax.Array,
-    log_scale: jax.Array,
-    params: LocalisationParams,
-) -> jax.Array:
-    """First stage: theta [S, 5] at the end of Adam from each start."""
-    per_segment = -(-params.iterations // len(SPREAD_M))
-    optimiser = optax.adam(optax.cosine_decay_schedule(1.0, per_segment * len(SPREAD_M), alpha=1e-3))
-    height_rate = jnp.where(params.height_std_m > FIXED_STD_M, jnp.minimum(params.height_std_m, 1.0), 0.0)
-    rate = params.learning_rate_m * jnp.concatenate([jnp.ones(2), height_rate[None], jnp.array(LOG_RATES)])
-
-    low, high = bounds
-    zero = jnp.zeros(initial_xy.shape[0])
-    columns = (initial_xy[:, 0], initial_xy[:, 1], zero + problem.height_m, zero, zero + log_scale)
-    theta = jnp.clip(jnp.stack(columns, axis=-1), low, high)
-    gradient = jax.vmap(jax.grad(_held_loss), (0, 0, 0, None, None))
-
-    Carry = tuple[jax.Array, optax.OptState]
-
-    def segment(carry: Carry, spread: jax.Array) -> tuple[Carry, None]:
-        strength = jax.lax.map(lambda t: _strength(problem, t), carry[0])
-        rates = jax.vmap(lambda t, s: s / (_squared_distance(problem, t, t) + spread**2))(carry[0], strength)
-        anchor = carry[0].at[:, 3:].set(jax.vmap(lambda r: _profile(problem, r, log_scale))(rates))
-
-        def iteration(carry: Carry, _: None) -> tuple[Carry, None]:
-            theta, memory = carry
-            update, memory = optimiser.update(gradient(theta, anchor, strength, spread, problem), memory)
-            # A spread source's height would make up for the spread.
-            step = jnp.where((jnp.arange(5) == 2) & (spread > 0.0), 0.0, rate * update)
-            return (jnp.clip(theta + step, low, high), memory), None
-
-        return jax.lax.scan(iteration, (anchor, carry[1]), None, length=per_segment)[0], None
-
-    return jax.lax.scan(segment, (theta, optimiser.init(theta)), jnp.array(SPREAD_M))[0][0]
-
-
-def _exact_rates(problem: FitProblem, theta: jax.Array) -> jax.Array:
-    """Net rate [n] per becquerel at ``theta``."""
-    place = position_of(problem.site, theta)
-    return net_rates(problem.site, problem.detectors, problem.measurements, place, problem.nuclide)
-
-
-def _strength(problem: FitProblem, theta: jax.Array) -> jax.Array:
-    """Net rate per becquerel times squared distance [n]: what changes slowly with the position."""
-    return _exact_rates(problem, theta) * _squared_distance(problem, theta, theta)
-
-
-def _squared_distance(problem: FitProblem, theta: jax.Array, anchor: jax.Array) -> jax.Array:
-    """Squared distance [n] in m² from ``theta`` to every crystal, on the tangent plane of the ground at ``anchor``."""
-    ground, slope = sample_with_gradient(problem.site.terrain_m, problem.site, anchor[:2])
-    place = jnp.append(theta[:2], ground + slope @ (theta[:2] - anchor[:2]) + theta[2])
-    return jnp.maximum(jnp.sum((problem.measurements.position_m - place) ** 2, axis=-1), 1e-4)
-
-
-def _held_loss(
-    theta: jax.Array, anchor: jax.Array, strength: jax.Array, spread: jax.Array, problem: FitProblem
-) -> jax.Array:
-    """Negative log posterior [] at ``theta`` [5] with the strength [n] of ``anchor`` [5] and a source spread over m."""
-    rates = strength / (_squared_distance(problem, theta, anchor) + spread**2)
-    return -_log_posterior(problem, theta, jnp.exp(theta[3]) * rates)
-
-
-def _log_posterior(problem: FitProblem, theta: jax.Array, net_cps: jax.Array) -> jax.Array:
-    m = problem.measurements
-    prior = 0.5 * height_precision(problem.height_std_m) * (theta[2] - problem.height_m) ** 2
-    return poisson_log_likelihood(m.counts, expected_counts(problem, net_cps, theta[4]), m.valid) - prior
-
-
-def _best(problem: FitProblem, candidates: jax.Array) -> jax.Array:
-    """The candidate [5] of largest exact posterior among [S, 5]."""
-    posterior = jax.lax.map(lambda t: _log_posterior(problem, t, jnp.exp(t[3]) * _exact_rates(problem, t)), candidates)
-    return candidates[jnp.argmax(jnp.where(jnp.isnan(posterior), -jnp.inf, posterior))]
-
-
 def _polish(
-    problem: FitProblem, bounds: tuple[jax.Array, jax.Array], theta: jax.Array, steps: int
+    problem: FitProblem, limits: Bounds, theta: jax.Array, steps: int
 ) -> tuple[jax.Array, Evaluation, jax.Array]:
     """Second stage: damped Fisher scoring from ``theta`` [5]; the end point, the likelihood there, whether it settled.
 
@@ -287,7 +149,7 @@ def _polish(
         damped = here.information + damping * jnp.diag(jnp.diagonal(here.information))
         move = scaled_inverse(damped) @ here.score
         move = move * jnp.minimum(1.0, jnp.min(reach / jnp.maximum(jnp.abs(move), 1e-9)))
-        return (theta, here, damping, jnp.clip(theta + move, *bounds)), here.log_posterior
+        return (theta, here, damping, jnp.clip(theta + move, *limits)), here.log_posterior
 
     unknown = -jnp.asarray(jnp.inf)
     nowhere = Evaluation(
@@ -299,14 +161,14 @@ def _polish(
 
 def _report(
     problem: FitProblem,
-    bounds: tuple[jax.Array, jax.Array],
+    limits: Bounds,
     theta: jax.Array,
     here: Evaluation,
     settled: jax.Array,
-    background_only: jax.Array,
+    without_source: jax.Array,
 ) -> SourceFit:
     """The fit at the end point ``theta`` [5]."""
-    low, high = bounds
+    low, high = limits
     # Where the data say nothing, a coordinate is known to the range it was sought in: uniform, variance range² / 12.
     information = here.information + jnp.diag(12.0 / jnp.square(high - low))
     covariance = scaled_inverse(information)
@@ -319,8 +181,8 @@ def _report(
         covariance_m2=position_covariance(problem.site, theta, covariance),
         activity_std_bq=activity * jnp.sqrt(covariance[3, 3]),
         log_likelihood=here.log_likelihood,
-        log_likelihood_background_only=background_only,
-        detection=jnp.maximum(2.0 * (here.log_likelihood - background_only), 0.0),
+        log_likelihood_background_only=without_source,
+        detection=jnp.maximum(2.0 * (here.log_likelihood - without_source), 0.0),
         reduced_deviance=-2.0 * here.log_likelihood / jnp.maximum(jnp.sum(problem.measurements.valid) - 5, 1),
         converged=settled & inside,
     )

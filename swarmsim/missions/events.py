@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 KINDS = ("finished", "crash", "obstacle", "vehicle", "battery_empty", "non_finite")
 """finished: landed or arrived · crash: hit the ground too hard or tipped over · obstacle, vehicle: collided with one
@@ -28,11 +29,11 @@ def record(times_s: jax.Array, happened: jax.Array, now_s: jax.Array) -> jax.Arr
     return jnp.where(happened & under_way(times_s), jnp.minimum(times_s, now_s), times_s)
 
 
-def under_way(times_s: jax.Array) -> jax.Array:
+def under_way(times_s: jax.Array | np.ndarray) -> jax.Array:
     """Whether nothing has ended the vehicle's part yet [...], from event times [..., kinds]."""
     return jnp.all(jnp.isinf(times_s), axis=-1)
 
 
-def crashed(times_s: jax.Array) -> jax.Array:
+def crashed(times_s: jax.Array | np.ndarray) -> jax.Array:
     """Whether the vehicle's part ended otherwise than by finishing [...]."""
     return ~under_way(times_s) & jnp.isinf(times_s[..., FINISHED])

@@ -7,6 +7,7 @@ import zlib
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 def consumer(mission_key: jax.Array, name: str) -> jax.Array:
@@ -23,6 +24,6 @@ def per_tick(key: jax.Array, ticks: jax.Array, vehicles: int) -> jax.Array:
     return jax.vmap(lambda tick: jax.vmap(lambda vehicle: one(tick, vehicle))(jnp.arange(vehicles)))(ticks)
 
 
-def mission_keys(seeds: jax.Array) -> jax.Array:
+def mission_keys(seeds: jax.Array | np.ndarray) -> jax.Array:
     """Keys [B] of the missions' seeds [B] (uint32)."""
     return jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))

@@ -140,7 +140,9 @@ class Simulation:
         )
         learn = self.stage(
             "learn from the ground",
-            lambda key, world, *known: knowledge.learn_from_ground(key, world, *known, per_window),
+            lambda key, world, known, air, counts: knowledge.learn_from_ground(
+                key, world, known, air, counts, per_window
+            ),
             (0, None, 0, 0, 0),
         )
         tell.phase("plan the route", 0.0)

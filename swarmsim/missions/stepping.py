@@ -1,5 +1,6 @@
 """A team stepped by hand: the caller says where each vehicle should go, a tick at a time, for B missions at once."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -135,6 +136,7 @@ class Stepper:
         return TeamState(key=state.key, tick=state.tick + 1, flights=flights, rover=rover), seen
 
 
+# vmap wants the tree of axes in the shape of the value: integers stand where the arrays will
 _OBSERVED: Any = Observation(
-    time_s=None, position_m=0, velocity_m_s=0, count_rate_cps=0, active=0, rover_position_m=0, rover_count_rate_cps=0
-)  # type: ignore[arg-type]
+    **{field.name: None if field.name == "time_s" else 0 for field in dataclasses.fields(Observation)}  # type: ignore[arg-type]
+)

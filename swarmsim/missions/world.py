@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.scenario import Scenario
@@ -118,7 +119,7 @@ def embodied(spec: Multirotor) -> Multirotor:
 def build_timing(scenario: Scenario, roles: Roles) -> Timing:
     """Periods of the scenario.
 
-    Raises `InputError` where a detector's sample period is not a whole number of control periods, or differs among UAVs.
+    Raises `InputError` where a detector's sample period is not a whole number of control periods, or the UAVs' differ.
     """
     dt = scenario.mission.time_step_s
     substeps = max(1, round(0.01 / dt))
@@ -187,7 +188,7 @@ def build_world(scenario: Scenario, site_model: SiteModel, roles: Roles) -> Worl
     )
 
 
-def _f32(value: float | Sequence[float] | np.ndarray) -> jax.Array:
+def _f32(value: ArrayLike) -> jax.Array:
     return jnp.asarray(value, jnp.float32)
 
 

@@ -123,7 +123,7 @@ def _path(task: AerialTask, site: Site, home: jax.Array, corners: jax.Array) -> 
     below = jnp.append(home, ground - BELOW_GROUND_M)
     whole = jnp.concatenate([foot + rise * (survey[0] - foot), survey, survey[-1] + rise * (below - survey[-1])])
     points, length = resample(whole, task.points)
-    vertical = jnp.gradient(points[:, 2]) / jnp.maximum(length / (task.points - 1), 1e-6)
+    vertical = jnp.asarray(jnp.gradient(points[:, 2])) / jnp.maximum(length / (task.points - 1), 1e-6)
     low = points[:, 2] < ground + TOUCHDOWN_HEIGHT_M
     down = jnp.where(low, task.touchdown_speed_m_s, task.descent_speed_m_s)
     cruise = jnp.where(vertical > 0.9, task.climb_speed_m_s, jnp.where(vertical < -0.9, down, task.speed_m_s))

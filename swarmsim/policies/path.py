@@ -39,7 +39,9 @@ def resample(waypoints_m: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
     return points, arc[-1]
 
 
-def limit_speed(points_m: jax.Array, cruise_m_s: jax.Array, acceleration_m_s2: float, corner_m: float) -> jax.Array:
+def limit_speed(
+    points_m: jax.Array, cruise_m_s: jax.Array, acceleration_m_s2: jax.Array | float, corner_m: float
+) -> jax.Array:
     """Speed [P] that starts and ends at rest, slows at corners and never asks for more than the acceleration.
 
     A corner of turning angle ``a`` may be rounded within ``corner_m``: the arc that stays that close to the vertex has

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 MOVES = np.array(
-    [(-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)]
-    + [(-2, -1), (-2, 1), (-1, -2), (-1, 2), (1, -2), (1, 2), (2, -1), (2, 1)]
+    [(r, c) for r in range(-2, 3) for c in range(-2, 3) if abs(r) + abs(c) in (1, 3) or abs(r) == abs(c) == 1]
 )  # (row, column)
 REACH = 2  # furthest a move goes along one axis
 
@@ -79,7 +78,7 @@ def descend(field: jax.Array, cost: jax.Array, start: jax.Array, cell_m: jax.Arr
     return jnp.concatenate([start[None], jax.lax.scan(step, start, None, length=steps)[1]])
 
 
-def smooth(points_m: jax.Array, half_width: int) -> jax.Array:
+def smooth(points_m: jax.Array, half_width: jax.Array | int) -> jax.Array:
     """Moving average of a polyline [P, D] over ``2 half_width + 1`` points, narrower at the ends, which stay."""
     count = points_m.shape[0]
     total = jnp.concatenate([jnp.zeros((1, points_m.shape[1])), jnp.cumsum(points_m - points_m[0], axis=0)])

@@ -17,7 +17,8 @@ SMALL = (
     "aerial.area_m=[[-6, -16], [30, -16], [30, 24], [-6, 24]]",
     "aerial.speed_m_s=4",
     "aerial.descent_speed_m_s=2",
-    "vehicles=[{name: uav1, type: tarot_t650, position_m: [20, -14]}, {name: uav2, type: tarot_t650, position_m: [22, 14]},"
+    "vehicles=[{name: uav1, type: tarot_t650, position_m: [20, -14]},"
+    " {name: uav2, type: tarot_t650, position_m: [22, 14]},"
     " {name: orpheus, type: orpheus, position_m: [24, -10]}]",
     "ground.laps=1",
     "localisation.iterations=60",

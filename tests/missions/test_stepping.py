@@ -12,7 +12,8 @@ from swarmsim.missions.events import KINDS
 TEAM = (
     "engine=analytic",
     "wind.gusts=false",
-    "vehicles=[{name: uav1, type: tarot_t650, position_m: [-40, 2]}, {name: uav2, type: tarot_t650, position_m: [-34, 2]},"
+    "vehicles=[{name: uav1, type: tarot_t650, position_m: [-40, 2]},"
+    " {name: uav2, type: tarot_t650, position_m: [-34, 2]},"
     " {name: orpheus, type: orpheus, position_m: [-24, 4], heading_deg: 0}]",
 )
 
