@@ -72,8 +72,8 @@ class Localisation(Model):
     starts: int = Field(ge=1, le=64)
     iterations: int = Field(ge=10, le=10_000)
     learning_rate_m: Positive
-    search_radius_m: Positive = 5.0
-    search_rounds: int = Field(default=14, ge=0, le=1000)
+    search_radius_m: Positive = 6.0
+    search_rounds: int = Field(default=12, ge=0, le=1000)
     fisher_steps: int = Field(default=6, ge=1, le=100)
 
 

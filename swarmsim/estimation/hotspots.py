@@ -4,9 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.estimation.radiation_map import MappingParams, RadiationMap
+from swarmsim.estimation.search import GOLDEN_ANGLE_RAD
 from swarmsim.pytree import pytree
-
-GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
 
 
 @pytree

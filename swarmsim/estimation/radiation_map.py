@@ -260,7 +260,7 @@ def _significance(excess: jax.Array, gain: jax.Array, noise_var: jax.Array, back
     noise_var / gain², which is that of a counter exposed for background gain² / noise_var seconds. The signed root of
     that counter's deviance 2 (n log(n/b) - n + b) is standard normal under bare background to a higher order than (n
     - b) / sqrt(b), whose skewness would double the false alarms at 5 sigma already with 900 counts (McCullagh &
-    Nelder 1989, section 2.4.2 and appendix C).
+    Nelder 1989, on deviance residuals).
     """
     known = (gain > 0.1) & (noise_var > 0.0) & (background > 0.0)
     level = jnp.maximum(background, 1e-6)

@@ -40,7 +40,7 @@ LOG_STEP = 1.0  # longest Fisher step of a logarithm
 HEIGHT_REACH = 4.0  # the height is sought within this many of its standard deviations
 # Adam moves every coordinate by about its rate per iteration: logarithms by these per metre of learning rate.
 LOG_RATES = (0.3, 0.1)
-OFFSPRING = 4  # points tried around each of the best ones in a round of the pattern search
+OFFSPRING = 8  # points tried around each of the best ones in a round of the pattern search
 LAST_REACH = 0.05  # of the first round's reach is that of the last
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
 GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly

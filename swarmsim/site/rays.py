@@ -7,7 +7,6 @@ from swarmsim.site.model import Obstacles, Site, sample
 
 GROUND_SAMPLES = 48  # points along a ray at which it is compared with the terrain
 _PARALLEL = 1e-9  # a direction component below this, in metres over the whole segment, is parallel to the slab
-_FAR = 1e6  # stands for an unbounded interval in units of the segment; finite, so that no inf - inf arises
 
 
 def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
@@ -23,10 +22,11 @@ def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
     squared = jnp.sum(direction * direction)
     distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
-    in_boxes = _box_fractions(site.obstacles, a, direction)
-    one_hot = site.obstacles.material[:, None] == materials
-    fractions = jnp.sum(jnp.where(one_hot, in_boxes[:, None], 0.0), axis=0)
-    fractions = fractions + jnp.where(materials == site.ground_material, _ground_fraction(site, a, direction), 0.0)
+    # one row for each box and one for the ground; a product, because as a sum it would be the dearest part
+    matter = jnp.append(site.obstacles.material, site.ground_material)
+    one_hot = (matter[:, None] == materials).astype(jnp.float32)
+    each = jnp.append(_box_fractions(site.obstacles, a, direction), _ground_fraction(site, a, direction))
+    fractions = jnp.dot(each, one_hot, precision=jax.lax.Precision.HIGHEST)
     total = jnp.sum(fractions)
     fractions = fractions / jnp.maximum(total, 1.0)
     if "air" in site.material_names:
@@ -36,31 +36,31 @@ def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> jax.Array:
-    """Fraction [K] of the segment within the matter of each box."""
+    """Fraction [K] of the segment within the matter of each box.
+
+    Written by components, so that the boxes are what is vectorised.
+    """
     offset = a - obstacles.centre_m
     c, s = obstacles.axis[:, 0], obstacles.axis[:, 1]
-    start = jnp.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]], -1)
-    along = jnp.stack(
-        [c * direction[0] + s * direction[1], c * direction[1] - s * direction[0], jnp.full_like(c, direction[2])], -1
-    )
-    outer = obstacles.half_extent_m
-    inner = outer - obstacles.wall_m[:, None]
-    hollow = (obstacles.wall_m > 0.0) & jnp.all(inner > 0.0, axis=-1)
-    empty = jnp.where(hollow, _slab_fraction(start, along, inner), 0.0)
-    return _slab_fraction(start, along, outer) - empty
+    start = (c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2])
+    along = (c * direction[0] + s * direction[1], c * direction[1] - s * direction[0], jnp.broadcast_to(direction[2], c.shape))
+    # A component too small to divide by is made just large enough: the slab's ends then lie far beyond the segment's.
+    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
+    middle = [-x * i for x, i in zip(start, inverse, strict=True)]
+    reach = [jnp.abs(i) for i in inverse]
+    outer = [obstacles.half_extent_m[:, k] for k in range(3)]
+    inner = [half - obstacles.wall_m for half in outer]
+    hollow = (obstacles.wall_m > 0.0) & (jnp.minimum(jnp.minimum(inner[0], inner[1]), inner[2]) > 0.0)
+    empty = jnp.where(hollow, _slab_fraction(middle, reach, inner), 0.0)
+    return _slab_fraction(middle, reach, outer) - empty
 
 
-def _slab_fraction(start: jax.Array, along: jax.Array, half: jax.Array) -> jax.Array:
-    """Fraction [K] of the segments start + t along, 0 <= t <= 1 [K, 3], within the boxes |x| <= half [K, 3]."""
-    parallel = jnp.abs(along) < _PARALLEL
-    inverse = 1.0 / jnp.where(parallel, 1.0, along)
-    middle = -start * inverse
-    reach = half * jnp.abs(inverse)
-    within = jnp.where(jnp.abs(start) <= half, _FAR, -_FAR)
-    enter = jnp.where(parallel, -within, middle - reach)
-    leave = jnp.where(parallel, within, middle + reach)
-    first = jnp.maximum(jnp.max(enter, axis=-1), 0.0)
-    last = jnp.minimum(jnp.min(leave, axis=-1), 1.0)
+def _slab_fraction(middle: list[jax.Array], reach: list[jax.Array], half: list[jax.Array]) -> jax.Array:
+    """Fraction [K] of the segments 0 <= t <= 1 within boxes, whose slabs are entered at middle -/+ reach half."""
+    enter = [m - r * h for m, r, h in zip(middle, reach, half, strict=True)]
+    leave = [m + r * h for m, r, h in zip(middle, reach, half, strict=True)]
+    first = jnp.maximum(jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2]), 0.0)
+    last = jnp.minimum(jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2]), 1.0)
     return jnp.maximum(last - first, 0.0)
 
 

@@ -31,7 +31,7 @@ from tests.estimation.survey import (
 )
 
 SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
-QUICK = settings(iterations=120, search_rounds=3, fisher_steps=4)
+QUICK = settings(iterations=120, search_rounds=2, fisher_steps=4)
 MAP = mapping(variance_kept=0.9, cell_m=5.0, length_scale_m=14.0)
 STARTS = jnp.array([[5.0, 8.0], [20.0, -2.0]])
 _compiled = jax.jit(localise)
