@@ -11,6 +11,9 @@
    the best ones so far, ever closer, find its bottom.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -40,6 +43,7 @@ LOG_STEP = 1.0  # longest Fisher step of a logarithm
 HEIGHT_REACH = 4.0  # the height is sought within this many of its standard deviations
 # Adam moves every coordinate by about its rate per iteration: logarithms by these per metre of learning rate.
 LOG_RATES = (0.3, 0.1)
+WINDOWS = 256  # windows whose rates the pattern search computes exactly
 OFFSPRING = 8  # points tried around each of the best ones in a round of the pattern search
 LAST_REACH = 0.05  # of the first round's reach is that of the last
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
@@ -167,6 +171,30 @@ def _log_posterior(problem: FitProblem, theta: jax.Array, net_cps: jax.Array) ->
     return poisson_log_likelihood(m.counts, expected_counts(problem, net_cps, theta[4]), m.valid) - prior
 
 
+def _rates_near(problem: FitProblem, candidates: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    """Net rates [n] per becquerel as a function of a place [3] around ``candidates`` [S, 5].
+
+    They are exact in the `WINDOWS` windows that see the candidates best, which hold nearly all that the data say about
+    the place; in the others the shadows are those of the best candidate, and only the distance counts.
+    """
+    m = problem.measurements
+    rates = jax.lax.map(lambda theta: _exact_rates(problem, theta), candidates)
+    value = jax.vmap(lambda t, r: _log_posterior(problem, t, jnp.exp(t[3]) * r))(candidates, rates)
+    best = jnp.argmax(jnp.where(jnp.isnan(value), -jnp.inf, value))
+    anchor = candidates[best]
+    strength = rates[best] * _squared_distance(problem, anchor, anchor)
+    told = jnp.where(m.valid, jnp.max(rates, axis=0) * m.exposure_s, -1.0)
+    _, seen = jax.lax.top_k(told, min(WINDOWS, told.shape[0]))
+    clear = replace(problem, measurements=jax.tree.map(lambda leaf: leaf[seen], m))
+
+    def near(place: jax.Array) -> jax.Array:
+        theta = jnp.concatenate([place, jnp.zeros(2)])
+        held = strength / _squared_distance(problem, theta, anchor)
+        return held.at[seen].set(_exact_rates(clear, theta))
+
+    return near
+
+
 def pattern_search(
     problem: FitProblem, bounds: Bounds, candidates: jax.Array, log_scale: jax.Array, reach_m: jax.Array, rounds: int
 ) -> jax.Array:
@@ -177,11 +205,12 @@ def pattern_search(
     """
     low, high = bounds
     beam = candidates.shape[0]
+    near_rates = _rates_near(problem, candidates)
     index = jnp.arange(beam * OFFSPRING)
     share = jnp.sqrt((index % OFFSPRING + 0.5) / OFFSPRING)
 
     def fit(place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        rates = _exact_rates(problem, place)
+        rates = near_rates(place)
         theta = jnp.concatenate([place, profile(problem, rates, log_scale)])
         value = _log_posterior(problem, theta, jnp.exp(theta[3]) * rates)
         return theta, jnp.where(jnp.isnan(value), -jnp.inf, value)
@@ -193,11 +222,11 @@ def pattern_search(
         up = height * jnp.minimum(reach, 1.5 * problem.height_std_m)
         offset = jnp.stack([reach * share * jnp.cos(turn), reach * share * jnp.sin(turn), up], axis=-1)
         places = jnp.clip(jnp.repeat(best[0][:, :3], OFFSPRING, axis=0) + offset, low[:3], high[:3])
-        tried = jax.lax.map(fit, places)
+        tried = jax.vmap(fit)(places)
         everyone = [jnp.concatenate(pair) for pair in zip(best, tried, strict=True)]
         value, chosen = jax.lax.top_k(everyone[1], beam)
         return (everyone[0][chosen], value), None
 
-    start = jax.lax.map(fit, candidates[:, :3])
+    start = jax.vmap(fit)(candidates[:, :3])
     (theta, value), _ = jax.lax.scan(round_, start, jnp.arange(rounds))
     return theta[jnp.argmax(value)]

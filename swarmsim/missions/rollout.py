@@ -10,9 +10,10 @@ import numpy as np
 from swarmsim.config.scenario import Scenario
 from swarmsim.estimation import Measurements
 from swarmsim.missions import events, keys, knowledge
+from swarmsim.missions.batching import Axes, batched, one_by_one, shards_of, spread
 from swarmsim.missions.drive import Drive
 from swarmsim.missions.flight import Flight
-from swarmsim.missions.knowledge import AerialKnowledge, GroundKnowledge
+from swarmsim.missions.knowledge import AerialKnowledge, GroundKnowledge, learn_from_ground
 from swarmsim.missions.measure import Log
 from swarmsim.missions.progress import Progress, SilentProgress
 from swarmsim.missions.simulation import Dynamics
@@ -62,7 +63,7 @@ class MissionBatch:
     def simulated_s(self) -> float:
         """Simulated seconds of all phases of all missions."""
         end = self.aerial.end_s if self.ground is None else self.ground.end_s
-        return float(jnp.sum(end))
+        return float(jnp.sum(end[: len(self.seeds)]))
 
 
 class Simulation:
@@ -82,7 +83,7 @@ class Simulation:
         self.world: World = build_world(scenario, site_model, self.roles)
         self.dynamics = Dynamics(scenario, self.roles, self.timing)
         self.clock = Clock()
-        self._stages: dict[tuple[str, int | None], Stage] = {}
+        self._stages: dict[tuple[str, int], Stage] = {}
         self._per_window = max(1, round(scenario.mission.localisation.window_s / self.timing.uav_tick_s))
 
     @property
@@ -95,7 +96,10 @@ class Simulation:
         tell = progress or SilentProgress()
         seeds = np.atleast_1d(np.asarray(seeds, np.int64))
         self.clock.reset()
-        mission_keys = keys.mission_keys(seeds)
+        # every device flies as many: the last seed fills up, and its copies are not looked at
+        shards = shards_of(len(seeds))
+        filled = np.append(seeds, np.repeat(seeds[-1], -len(seeds) % shards))
+        mission_keys = keys.mission_keys(filled)
         aerial = self._survey(mission_keys, tell)
         ground = None if self.world.rover is None else self._search(mission_keys, aerial, tell)
         return MissionBatch(seeds=seeds, aerial=aerial, ground=ground, clock=self.clock)
@@ -104,18 +108,18 @@ class Simulation:
         missions, per_window = len(mission_keys), self._per_window
         starts = self.scenario.mission.localisation.starts
         plan = self.stage("plan the survey", self.dynamics.plan_survey, (None,), missions)
-        fly = self.stage("fly", self.dynamics.fly, (0, None, 0, 0, None))
-        count = self.stage("count", knowledge.count_from_air, (0, None, 0))
+        ready = self.stage("take off", self.dynamics.ready_to_fly, (0, None), missions)
+        fly = self.stage("fly", self.dynamics.fly, (0, None, 0, 0, None), missions)
+        count = self.stage("count", knowledge.count_from_air, (0, None, 0), missions, in_step=False)
         learn = self.stage(
             "learn from the air",
             lambda world, counts: knowledge.learn_from_air(world, counts, per_window, starts),
-            (None, 0),
-        )
+            (None, 0), missions, in_step=False,
+        )  # fmt: skip
         paths = plan(self.world)
-        flights = self.stage("take off", self.dynamics.ready_to_fly, (0, None))(mission_keys, self.world)
         flights, log = self._segments(
             "aerial survey", tell, self.scenario.mission.aerial.time_limit_s, self.timing.uav_tick_s, SEGMENT_TICKS,
-            lambda state, ticks: fly(mission_keys, self.world, paths, state, ticks), flights,
+            lambda state, ticks: fly(mission_keys, self.world, paths, state, ticks), ready(mission_keys, self.world),
         )  # fmt: skip
         tell.phase("map and estimate", 0.0)
         measurements = count(mission_keys, self.world, log)
@@ -130,28 +134,26 @@ class Simulation:
         )
 
     def _search(self, mission_keys: jax.Array, aerial: Aerial, tell: Progress) -> Ground:
-        per_window, per_sample = self._per_window, self.timing.rover_ticks
-        plan = self.stage("plan the route", self.dynamics.plan_route, (None, 0, 0))
-        drive = self.stage("drive", self.dynamics.drive, (None, 0, 0, None))
+        missions, per_window, per_sample = len(mission_keys), self._per_window, self.timing.rover_ticks
+        plan = self.stage("plan the route", self.dynamics.plan_route, (None, 0, 0), missions, in_step=False)
+        ready = self.stage("set out", self.dynamics.ready_to_drive, (None, 0), missions)
+        drive = self.stage("drive", self.dynamics.drive, (None, 0, 0, None), missions)
         count = self.stage(
             "count on the ground",
             lambda key, world, log: knowledge.count_on_ground(key, world, log, per_sample),
-            (0, None, 0),
-        )
+            (0, None, 0), missions, in_step=False,
+        )  # fmt: skip
         learn = self.stage(
             "learn from the ground",
-            lambda key, world, known, air, counts: knowledge.learn_from_ground(
-                key, world, known, air, counts, per_window
-            ),
-            (0, None, 0, 0, 0),
-        )
+            lambda key, world, known, air, counts: learn_from_ground(key, world, known, air, counts, per_window),
+            (0, None, 0, 0, 0), missions, in_step=False,
+        )  # fmt: skip
         tell.phase("plan the route", 0.0)
         route = plan(self.world, aerial.knowledge.fit.position_m[:, :2], aerial.knowledge.found)
-        rover = self.stage("set out", self.dynamics.ready_to_drive, (None, 0))(self.world, aerial.end_s)
         segment = per_sample * max(1, round(ROVER_SEGMENT_S / (per_sample * self.timing.rover_tick_s)))
         rover, log = self._segments(
             "ground search", tell, self.scenario.mission.ground.time_limit_s, self.timing.rover_tick_s, segment,
-            lambda state, ticks: drive(self.world, route, state, ticks), rover,
+            lambda state, ticks: drive(self.world, route, state, ticks), ready(self.world, aerial.end_s),
         )  # fmt: skip
         tell.phase("identify and refine", 0.0)
         measurements = count(mission_keys, self.world, log)
@@ -181,16 +183,18 @@ class Simulation:
         return state, jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *logs)
 
     def stage(
-        self, name: str, function: Any, axes: tuple[Any, ...], size: int | None = None, out_axes: Any = 0
+        self, name: str, function: Any, axes: Axes, missions: int, *, in_step: bool = True, out_axes: Any = 0
     ) -> Stage:
-        """The compiled batch form of a function of one mission: ``axes`` tells which arguments have the axis B.
+        """The compiled form for a number of missions of a function of one: ``axes`` tells which arguments are theirs.
 
-        ``size`` is B where no argument has the axis. What is compiled is kept for the life of the simulation.
+        ``in_step`` missions are vmapped, else they run one after the other. What is compiled is kept for the life of
+        the simulation.
         """
-        if (name, size) not in self._stages:
-            batched = jax.vmap(function, in_axes=axes, out_axes=out_axes, axis_size=size)
-            self._stages[name, size] = Stage(name, batched, self.clock)
-        return self._stages[name, size]
+        if (name, missions) not in self._stages:
+            shards = shards_of(missions) if out_axes == 0 else 1
+            part = batched(function, axes, missions // shards, out_axes) if in_step else one_by_one(function, axes)
+            self._stages[name, missions] = Stage(name, spread(part, axes, shards), self.clock)
+        return self._stages[name, missions]
 
 
 def _end(event_time_s: jax.Array, log_time_s: jax.Array) -> jax.Array:

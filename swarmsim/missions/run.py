@@ -9,6 +9,7 @@ import platformdirs
 from swarmsim.config.errors import raise_if_any
 from swarmsim.config.geometry import check_geometry
 from swarmsim.config.scenario import Scenario
+from swarmsim.missions.batching import use_all_cores
 from swarmsim.missions.extract import mission_record
 from swarmsim.missions.files import write_run
 from swarmsim.missions.out_folder import check_out
@@ -33,6 +34,7 @@ def build(scenario: Scenario) -> Simulation:
     Raises `InputError` with everything that is wrong.
     """
     keep_compiled()
+    use_all_cores()
     site_model = load_site(scenario.site_file, tuple(scenario.materials))
     raise_if_any(check_geometry(scenario, site_model))
     return Simulation(scenario, site_model)

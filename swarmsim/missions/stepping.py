@@ -69,11 +69,14 @@ class Stepper:
         """The teams of the missions ``seeds`` (a number, or a sequence of B) at rest at their starts."""
         simulation, world = self._simulation, self._simulation.world
         mission_keys = keys.mission_keys(np.atleast_1d(np.asarray(seeds, np.int64)))
-        flights = simulation.stage("take off", simulation.dynamics.ready_to_fly, (0, None))(mission_keys, world)
+        missions = len(mission_keys)
+        flights = simulation.stage("take off", simulation.dynamics.ready_to_fly, (0, None), missions)(
+            mission_keys, world
+        )
         rover = None
         if world.rover is not None:
-            ready = simulation.stage("set out", simulation.dynamics.ready_to_drive, (None, 0))
-            rover = ready(world, jnp.zeros(len(mission_keys)))
+            ready = simulation.stage("set out", simulation.dynamics.ready_to_drive, (None, 0), missions)
+            rover = ready(world, jnp.zeros(missions))
         return TeamState(key=mission_keys, tick=jnp.int32(0), flights=flights, rover=rover)
 
     def hold(self, state: TeamState) -> Command:
@@ -98,7 +101,8 @@ class Stepper:
         if wanted != given:
             raise ValueError(f"the command's shapes are {given}, they must be {wanted}")
         axes = (TeamState(key=0, tick=None, flights=0, rover=0), None, 0)  # type: ignore[arg-type]
-        stage = self._simulation.stage("step by hand", self._tick, axes, out_axes=(axes[0], _OBSERVED))
+        missions = state.key.shape[0]
+        stage = self._simulation.stage("step by hand", self._tick, axes, missions, out_axes=(axes[0], _OBSERVED))
         return stage(state, self._simulation.world, command)
 
     def _tick(self, state: TeamState, world: World, command: Command) -> tuple[TeamState, Observation]:

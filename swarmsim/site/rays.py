@@ -43,7 +43,11 @@ def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> 
     offset = a - obstacles.centre_m
     c, s = obstacles.axis[:, 0], obstacles.axis[:, 1]
     start = (c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2])
-    along = (c * direction[0] + s * direction[1], c * direction[1] - s * direction[0], jnp.broadcast_to(direction[2], c.shape))
+    along = (
+        c * direction[0] + s * direction[1],
+        c * direction[1] - s * direction[0],
+        jnp.broadcast_to(direction[2], c.shape),
+    )
     # A component too small to divide by is made just large enough: the slab's ends then lie far beyond the segment's.
     inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
     middle = [-x * i for x, i in zip(start, inverse, strict=True)]
