@@ -11,9 +11,6 @@
    the best ones so far, ever closer, find its bottom.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import optax
@@ -43,7 +40,6 @@ LOG_STEP = 1.0  # longest Fisher step of a logarithm
 HEIGHT_REACH = 4.0  # the height is sought within this many of its standard deviations
 # Adam moves every coordinate by about its rate per iteration: logarithms by these per metre of learning rate.
 LOG_RATES = (0.3, 0.1)
-WINDOWS = 256  # windows whose rates the pattern search computes exactly
 OFFSPRING = 8  # points tried around each of the best ones in a round of the pattern search
 LAST_REACH = 0.05  # of the first round's reach is that of the last
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
@@ -166,33 +162,10 @@ def _held_loss(
 
 
 def _log_posterior(problem: FitProblem, theta: jax.Array, net_cps: jax.Array) -> jax.Array:
+    """Log posterior [] at ``theta`` [5] with the net rates ``net_cps`` [n]: the likelihood and the height's prior."""
     m = problem.measurements
     prior = 0.5 * height_precision(problem.height_std_m) * (theta[2] - problem.height_m) ** 2
     return poisson_log_likelihood(m.counts, expected_counts(problem, net_cps, theta[4]), m.valid) - prior
-
-
-def _rates_near(problem: FitProblem, candidates: jax.Array) -> Callable[[jax.Array], jax.Array]:
-    """Net rates [n] per becquerel as a function of a place [3] around ``candidates`` [S, 5].
-
-    They are exact in the `WINDOWS` windows that see the candidates best, which hold nearly all that the data say about
-    the place; in the others the shadows are those of the best candidate, and only the distance counts.
-    """
-    m = problem.measurements
-    rates = jax.lax.map(lambda theta: _exact_rates(problem, theta), candidates)
-    value = jax.vmap(lambda t, r: _log_posterior(problem, t, jnp.exp(t[3]) * r))(candidates, rates)
-    best = jnp.argmax(jnp.where(jnp.isnan(value), -jnp.inf, value))
-    anchor = candidates[best]
-    strength = rates[best] * _squared_distance(problem, anchor, anchor)
-    told = jnp.where(m.valid, jnp.max(rates, axis=0) * m.exposure_s, -1.0)
-    _, seen = jax.lax.top_k(told, min(WINDOWS, told.shape[0]))
-    clear = replace(problem, measurements=jax.tree.map(lambda leaf: leaf[seen], m))
-
-    def near(place: jax.Array) -> jax.Array:
-        theta = jnp.concatenate([place, jnp.zeros(2)])
-        held = strength / _squared_distance(problem, theta, anchor)
-        return held.at[seen].set(_exact_rates(clear, theta))
-
-    return near
 
 
 def pattern_search(
@@ -205,12 +178,11 @@ def pattern_search(
     """
     low, high = bounds
     beam = candidates.shape[0]
-    near_rates = _rates_near(problem, candidates)
     index = jnp.arange(beam * OFFSPRING)
     share = jnp.sqrt((index % OFFSPRING + 0.5) / OFFSPRING)
 
     def fit(place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        rates = near_rates(place)
+        rates = _exact_rates(problem, place)
         theta = jnp.concatenate([place, profile(problem, rates, log_scale)])
         value = _log_posterior(problem, theta, jnp.exp(theta[3]) * rates)
         return theta, jnp.where(jnp.isnan(value), -jnp.inf, value)

@@ -78,15 +78,16 @@ def count(
         return draw_counts(detector, jax.random.fold_in(key, number), mean, detector.sample_period_s)
 
     counts, exposure = jax.vmap(draw)(numbers, rates.reshape(samples, per_sample).mean(axis=1))
-    middle = per_sample // 2
 
-    def of_sample(x: jax.Array, at: int) -> jax.Array:
-        return x.reshape(samples, per_sample, *x.shape[1:])[:, at]
+    def mean(x: jax.Array) -> jax.Array:
+        return x.reshape(samples, per_sample, *x.shape[1:]).mean(axis=1)
 
+    mean_axis = mean(axis)
     return Measurements(
-        time_s=of_sample(log.time_s, -1),
-        position_m=of_sample(centre, middle),
-        axis=of_sample(axis, middle),
+        time_s=log.time_s.reshape(samples, per_sample)[:, -1],
+        position_m=mean(centre),
+        travel_m=mean(log.velocity_m_s) * detector.sample_period_s,
+        axis=mean_axis / jnp.linalg.norm(mean_axis, axis=-1, keepdims=True),
         counts=counts.astype(jnp.float32),
         exposure_s=exposure,
         valid=jnp.all(log.active.reshape(samples, per_sample), axis=1),

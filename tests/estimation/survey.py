@@ -64,6 +64,7 @@ def windows(position, exposure=1.0, which=0):
     return Measurements(
         time_s=jnp.arange(1.0, n + 1),
         position_m=jnp.asarray(position, jnp.float32),
+        travel_m=jnp.zeros((n, 3)),
         axis=jnp.tile(jnp.array([0.0, 0.0, 1.0]), (n, 1)),
         counts=jnp.zeros(n),
         exposure_s=jnp.full(n, exposure),

@@ -1,7 +1,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import given
+import pytest
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.stats import poisson
 
@@ -12,6 +13,7 @@ from swarmsim.estimation.likelihood import (
     poisson_log_likelihood,
     position_covariance,
     scaled_inverse,
+    travel_gain,
 )
 from swarmsim.radiation import Source, net_rate
 from swarmsim.site import path_lengths
@@ -140,3 +142,14 @@ def test_inverse_of_matrices_with_entries_of_many_decades(seed):
     ours = np.asarray(scaled_inverse(jnp.asarray(matrix, jnp.float32)), np.float64)
     product = (ours * scale[:, None] * scale) @ (root @ root.T)
     np.testing.assert_allclose(product, np.eye(5), atol=0.03)
+
+
+@given(st.lists(st.floats(-8.0, 8.0), min_size=6, max_size=6))
+def test_travel_gain_is_the_mean_of_inverse_square_over_the_way(numbers):
+    offset, travel = np.array(numbers[:3]), 0.4 * np.array(numbers[3:])
+    part = (np.arange(4000) + 0.5) / 4000 - 0.5
+    squared = np.sum((offset + part[:, None] * travel) ** 2, axis=1)
+    assume(squared.min() > 0.05)
+    expected = np.mean(1.0 / squared) * np.sum(offset**2)
+    gain = travel_gain(jnp.array(offset, jnp.float32)[None], jnp.array(travel, jnp.float32)[None])
+    assert float(gain[0]) == pytest.approx(expected, rel=2e-3)
