@@ -153,7 +153,7 @@ def judge(
     site: Site,
     now_s: jax.Array,
 ) -> Flight:
-    """The flight after a tick, with its events recorded; a finished or non-finite vehicle stands where it was.
+    """The flight after a tick, with its events recorded; one that has finished stays where it is.
 
     Args:
         params: of the vehicle.
@@ -185,7 +185,7 @@ def judge(
     happened = jnp.where(finite, happened & ~(crash & (jnp.arange(len(happened)) == events.FINISHED)), False)
     happened = happened.at[events.NON_FINITE].set(~finite)
     times = events.record(before.event_time_s, happened, now_s)
-    standing = jnp.isfinite(times[events.FINISHED]) | ~finite
+    standing = jnp.isfinite(before.event_time_s[events.FINISHED]) | ~finite
     still = jax.tree.map(lambda old, new: jnp.where(standing, old, new), before, after)
     return replace(still, event_time_s=times)
 
