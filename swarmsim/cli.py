@@ -91,6 +91,37 @@ def run(
 
 
 @command
+def bench(
+    scenario: str = "recon",
+    *,
+    missions: Annotated[int, Parameter(validator=Number(gte=2, lte=1_000_000))] = 64,
+    repeats: Annotated[int, Parameter(validator=Number(gte=1, lte=100))] = 2,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+) -> None:
+    """Measure how fast a scenario flies here: one mission, and a batch against it. Writes nothing.
+
+    For example:
+        swarmsim bench
+        swarmsim bench recon --missions 256
+        swarmsim bench recon --set engine=analytic
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission, or a mission file.
+    missions
+        How many missions the batch has; 64 by default.
+    repeats
+        Rollouts of which the fastest counts; 2 by default.
+    overrides
+        Change a value of the mission, as path=value.
+    """
+    from swarmsim.cli_run import bench_scenario
+
+    bench_scenario(scenario, missions, repeats, overrides)
+
+
+@command
 def view(run: Path, *, web: bool = False) -> None:
     """Open the recording of a run in the Rerun viewer.
 

@@ -70,6 +70,34 @@ def run_scenario(
         console.print(f"Watch:   swarmsim view {folder}", highlight=False, soft_wrap=True)
 
 
+def bench_scenario(name: str, missions: int, repeats: int, overrides: Sequence[str]) -> None:
+    """Print the speed of one mission and of a batch, and their ratio."""
+    from swarmsim.config.scenario import load_scenario
+    from swarmsim.missions.benchmark import measure
+    from swarmsim.missions.progress import RichProgress
+    from swarmsim.missions.run import build
+
+    simulation = build(load_scenario(name, overrides))
+    with RichProgress(Console(stderr=True)) as progress:
+        alone = measure(simulation, 1, repeats, progress)
+    with RichProgress(Console(stderr=True), missions) as progress:
+        together = measure(simulation, missions, repeats, progress)
+    table = Table("what", "one mission", f"{missions} missions", title=name, title_justify="left")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for stage in together.stages_s:
+        table.add_row(f"{stage} [s]", f"{alone.stages_s[stage]:.3f}", f"{together.stages_s[stage]:.3f}")
+    for label, one, all_ in (
+        ("simulated [s]", alone.simulated_s, together.simulated_s),
+        ("rollout [s]", alone.run_s, together.run_s),
+        ("compilation [s]", alone.compile_s, together.compile_s),
+        ("real-time factor", alone.real_time_factor, together.real_time_factor),
+        ("throughput against one at a time", 1.0, together.real_time_factor / alone.real_time_factor),
+    ):
+        table.add_row(label, f"{one:,.2f}", f"{all_:,.2f}")
+    Console().print(table)
+
+
 def read_summary(folder: Path) -> dict[str, Any]:
     """The content of a run's summary."""
     summary: dict[str, Any] = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))

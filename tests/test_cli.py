@@ -200,9 +200,17 @@ def test_force_never_replaces_what_is_no_run(
     (project / "notes").mkdir()
     (project / "notes" / "diary.txt").write_text("dear diary")
     (project / "file").write_text("")
-    for out, fragment in (("notes", "something else than a run"), ("file", "a file where"), ("file/x", "cannot be")):
+    before = everything(project)
+    for out, message in (
+        ("notes", "the folder holds something else than a run, and is not replaced"),
+        ("file", "there is something else than a folder where the results should go"),
+        ("file/x", "the results cannot be written there"),
+    ):
         assert cli.main(["run", "recon", "--force", "--out", out]) == 2
-        assert fragment in capsys.readouterr().err
+        printed = capsys.readouterr().err
+        assert f"--out: {message}" in printed
+        assert f"given:   {out}\n" in printed
+    assert everything(project) == before
     assert (project / "notes" / "diary.txt").read_text() == "dear diary"
 
 

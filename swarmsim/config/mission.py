@@ -28,7 +28,10 @@ class TeamMember(Model):
 
 
 class Wind(Model):
-    """Steady wind at 20 ft and Dryden gusts (MIL-F-8785C, low altitude)."""
+    """Steady wind at 20 ft and Dryden gusts (MIL-F-8785C, low altitude).
+
+    ``from_deg`` is the bearing that it blows from, clockwise from north as weather stations give it.
+    """
 
     speed_m_s: float = Field(default=0.0, ge=0, le=30)
     from_deg: float = Field(default=0.0, ge=-360, le=360)

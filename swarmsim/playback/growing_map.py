@@ -29,6 +29,11 @@ class MapGrid:
         corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).reshape(-1, 1)
         return (corner + np.array([[0, 1, nx + 1, 0, nx + 1, nx]])).reshape(-1, 3).astype(np.uint32)
 
+    def triangles_where(self, seen: NDArray[np.bool_]) -> NDArray[np.uint32]:
+        """Those of the triangles [t, 3] whose three corners are ``seen`` [ny, nx]."""
+        triangles = self.triangles
+        return triangles[seen.reshape(-1)[triangles].all(axis=1)]
+
 
 def grid_of(radiation_map: RadiationMap) -> MapGrid:
     """The grid to draw ``radiation_map`` on."""

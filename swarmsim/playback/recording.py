@@ -217,30 +217,31 @@ def _send_measurements(
 
 
 def _send_map(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel, scale: RateScale) -> None:
-    """The growing map: a mesh over the ground whose colours and triangles are sent anew for each snapshot."""
-    made = growing_map.snapshots(record, MAP_SNAPSHOTS)
-    if not made:
-        return
+    """The growing map: a mesh over the ground whose colours and triangles are sent anew for each snapshot.
+
+    The points come once, at the time of the first triangles and after them in the file: the viewer reads points that
+    have no triangles yet as a triangle for every three of them, and complains.
+    """
     grid = growing_map.grid_of(record.map)
-    stream.log(
-        "world/map",
-        rr.Mesh3D.from_fields(
-            vertex_positions=growing_map.drape(grid, site_model.site, MAP_ABOVE_GROUND_M),
-            albedo_factor=[255, 255, 255, MAP_OPACITY],
-        ),
-        static=True,
-    )
-    triangles = [grid.triangles[s.seen.reshape(-1)[grid.triangles].all(axis=1)] for s in made]
-    made = [s for s, t in zip(made, triangles, strict=True) if len(t)]
-    triangles = [t for t in triangles if len(t)]
-    colours = scale(np.stack([s.rate_cps for s in made])).reshape(-1, 4)
+    drawn = [(s, grid.triangles_where(s.seen)) for s in growing_map.snapshots(record, MAP_SNAPSHOTS)]
+    drawn = [(s, triangles) for s, triangles in drawn if len(triangles)]
+    if not drawn:
+        return
+    points = growing_map.drape(grid, site_model.site, MAP_ABOVE_GROUND_M)
+    colours = scale(np.stack([s.rate_cps for s, _ in drawn])).reshape(-1, 4)
+    triangles = [t for _, t in drawn]
+    times = np.array([s.time_s for s, _ in drawn])
+    stream.log("world/map", rr.Mesh3D.from_fields(albedo_factor=[255, 255, 255, MAP_OPACITY]), static=True)
     stream.send_columns(
         "world/map",
-        _times(np.array([s.time_s for s in made])),
+        _times(times),
         [
-            *rr.Mesh3D.columns(vertex_colors=colours).partition([len(grid.x_m) * len(grid.y_m)] * len(made)),
+            *rr.Mesh3D.columns(vertex_colors=colours).partition([len(points)] * len(drawn)),
             *rr.Mesh3D.columns(triangle_indices=np.concatenate(triangles)).partition([len(t) for t in triangles]),
         ],
+    )
+    stream.send_columns(
+        "world/map", _times(times[:1]), rr.Mesh3D.columns(vertex_positions=points).partition([len(points)])
     )
 
 

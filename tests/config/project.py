@@ -1,4 +1,4 @@
-"""A project folder to spoil: the shipped mission with a detector and a site that the tests control."""
+"""A project folder to spoil: shipped vehicles, nuclides and materials; missions, detectors and a site of the tests."""
 
 import shutil
 from pathlib import Path
@@ -29,18 +29,77 @@ licence: CC0-1.0
 cell_m: 0.5
 """
 
+# The tests edit these texts and name their lines. They share the names of the shipped missions, not their numbers.
+MISSION = """\
+# Three survey UAVs and a rover on a made-up site,
+# with one source in the open.
+name: recon
+description: Three UAVs map the radiation of a two-hectare site, a rover drives to the hotspot and identifies it.
+site: works_yard
+seed: 0
+engine: mjx
+time_step_s: 0.005
+detection: physical
+sources:
+  - {nuclide: Co-60, position_m: [12.0, 4.0], height_m: 1.0, activity_mbq: 170.0}
+vehicles:
+  - {name: uav1, type: tarot_t650, position_m: [-60.0, -45.0], heading_deg: 0.0}
+  - {name: uav2, type: tarot_t650, position_m: [-60.0, -5.0], heading_deg: 0.0}
+  - {name: uav3, type: tarot_t650, position_m: [-60.0, 35.0], heading_deg: 0.0}
+  - {name: orpheus, type: orpheus, position_m: [-62.0, -10.0], heading_deg: 0.0}
+wind: {speed_m_s: 2.0, from_deg: 240.0, gusts: true}
+aerial:
+  policy: parallel_lines
+  altitude_m: 20.0
+  sweep_deg: 0.0
+  speed_m_s: 2.5
+  climb_speed_m_s: 2.0
+  descent_speed_m_s: 1.5
+  touchdown_speed_m_s: 0.5
+  obstacle_clearance_m: 5.0
+  separation_m: 6.0
+  time_limit_s: 600.0
+mapping: {cell_m: 2.0, length_scale_m: 6.0, hotspots_max: 4, hotspot_separation_m: 15.0, significance_sigma: 5.0}
+localisation:
+  presumed_nuclide: Co-60
+  presumed_height_m: 0.5
+  height_std_m: 0.5
+  window_s: 1.0
+  starts: 4
+  iterations: 200
+  learning_rate_m: 0.3
+ground:
+  policy: approach_and_orbit
+  speed_m_s: 0.9
+  standoff_m: 4.0
+  viewpoints: 8
+  time_limit_s: 600.0
+  spectrum_radius_m: 12.0
+  confidence_min: 0.9
+"""
+
+PAPER_MISSION = """\
+extends: recon
+name: recon_paper
+detection: paper_ideal
+"""
+
 
 def make_project(folder: Path) -> Path:
-    """Copy the shipped vehicles, nuclides, materials and missions to ``folder/configs``; the path of recon.yaml."""
+    """Fill ``folder/configs`` with the shipped things and those of the tests; the path of its recon.yaml."""
     configs = folder / "configs"
-    for kind in ("vehicles", "nuclides", "materials", "missions"):
+    for kind in ("vehicles", "nuclides", "materials"):
         shutil.copytree(packaged_dir() / kind, configs / kind)
     (configs / "detectors").mkdir()
     for name in ("nai_2x2", "nai_1p5x1p5"):
         (configs / "detectors" / f"{name}.yaml").write_text(DETECTOR.replace("nai_2x2", name), encoding="utf-8")
     (configs / "sites" / "works_yard").mkdir(parents=True)
     (configs / "sites" / "works_yard" / "site.yaml").write_text(SITE, encoding="utf-8")
-    return configs / "missions" / "recon.yaml"
+    missions = configs / "missions"
+    missions.mkdir()
+    (missions / "recon_paper.yaml").write_text(PAPER_MISSION, encoding="utf-8")
+    (missions / "recon.yaml").write_text(MISSION, encoding="utf-8")
+    return missions / "recon.yaml"
 
 
 def line_of(path: Path, text: str) -> int:

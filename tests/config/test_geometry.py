@@ -10,7 +10,7 @@ from swarmsim.config.geometry import check_geometry
 from swarmsim.config.scenario import load_scenario
 from swarmsim.config.site import SiteSpec
 from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
-from tests.config.project import line_of
+from tests.config.project import line_of, spoil
 
 # 160 m x 140 m around the origin, 2 m high ground. Boxes: a building of 20 x 10 x 6 m with walls of 0.3 m, turned by
 # 90 degrees; a solid wall of 20 x 1 x 4 m; a hedge of 4 x 4 x 2 m; a place holder of no size.
@@ -91,9 +91,8 @@ def test_what_fits_though_it_is_near(mission: Path, site: SiteModel, override: s
 
 
 def test_everything_is_told_at_once_with_lines(mission: Path, site: SiteModel) -> None:
-    mission.write_text(
-        mission.read_text().replace("[12.0, 4.0]", "[90.0, 4.0]").replace("[-60.0, 35.0]", "[45.0, 20.0]")
-    )
+    spoil(mission, "[12.0, 4.0]", "[90.0, 4.0]")
+    spoil(mission, "[-60.0, 35.0]", "[45.0, 20.0]")
     problems = check_geometry(load_scenario(mission), site)
     assert [(problem.path, problem.line) for problem in problems] == [
         ("sources.0.position_m", line_of(mission, "[90.0")),

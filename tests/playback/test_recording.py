@@ -152,6 +152,37 @@ def test_map_grows_and_ends_as_the_missions_own(recording: Recording, found: Mis
     assert np.corrcoef(green, found.map.mean_cps.reshape(-1))[0, 1] > 0.95
 
 
+def test_map_has_triangles_whenever_it_has_points(recording: Recording, found: MissionRecord) -> None:
+    """What the viewer finds at any time, looking back from it: points alone are a mesh that it cannot load."""
+    columns = {
+        name: recording.rows("/world/map", f"Mesh3D:{name}")
+        for name in ("vertex_positions", "triangle_indices", "vertex_colors")
+    }
+    assert len(columns["vertex_positions"][0]) > 0
+    changes = np.unique([when for times, _ in columns.values() for when in np.nan_to_num(times)])
+    for now in np.r_[-1.0, 0.0, changes, changes - 1e-6, changes + 1e-6, found.end_s, np.inf]:
+        seen = {}
+        for name, (times, values) in columns.items():
+            past = np.flatnonzero(np.isnan(times) | (times <= now))  # static data hold at all times
+            seen[name] = values[past[-1]] if len(past) else []
+        points, triangles = len(seen["vertex_positions"]), seen["triangle_indices"]
+        assert (points > 0) == (len(triangles) > 0) == (now >= changes[0]), f"at {now} s"
+        if points:
+            assert np.max(triangles) < points == len(seen["vertex_colors"])
+
+
+def test_survey_too_short_for_a_map_is_recorded_without_one(
+    found: MissionRecord, site: SiteModel, tmp_path: Path
+) -> None:
+    unknown = dataclasses.replace(found.map, mean_cps=np.full_like(found.map.mean_cps, np.nan))
+    aerial = np.flatnonzero(found.samples.phase == "aerial")[:1]
+    names = [field.name for field in dataclasses.fields(found.samples)]
+    one = dataclasses.replace(found.samples, **{name: getattr(found.samples, name)[aerial] for name in names})
+    path = tmp_path / "short.rrd"
+    write_recording(dataclasses.replace(found, map=unknown, samples=one), site, path)
+    assert "/world/map" not in Recording(path).tables
+
+
 def test_map_lies_just_above_the_ground(recording: Recording) -> None:
     _, (points,) = recording.rows("/world/map", "Mesh3D:vertex_positions")
     x, y, z = np.array(points).T
