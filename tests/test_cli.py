@@ -300,3 +300,11 @@ def test_a_reader_that_has_seen_enough_is_no_error(project: Path) -> None:
     environment = os.environ | {"PYTHONPATH": str(Path(cli.__file__).parents[1])}
     result = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True, env=environment)
     assert (result.stdout, result.stderr) == ("{\n", "")
+
+
+def test_an_impossible_place_for_the_results_is_told(
+    project: Path, fly: Callable[[Fly], None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    fly(write_results)
+    assert cli.main(["run", "recon", "--out", "x" * 300]) == 2
+    assert "cannot be written there (File name too long)" in capsys.readouterr().err

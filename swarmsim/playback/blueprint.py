@@ -101,20 +101,25 @@ def _plots(record: MissionRecord) -> rrb.Container:
     """Count rates and batteries against the time of the phase that they belong to."""
     whole = (min(p.start_s for p in record.phases), record.end_s)
 
-    def plot(origin: str, name: str, span: tuple[float, float] | None) -> rrb.TimeSeriesView:
+    def plot(
+        origin: str, name: str, span: tuple[float, float] | None, legend: rrb.Corner2D = rrb.Corner2D.LeftTop
+    ) -> rrb.TimeSeriesView:
         shown = span if span is not None and span[1] > span[0] else whole
         start, end = (rrb.TimeRangeBoundary.absolute(seconds=s) for s in shown)
         return rrb.TimeSeriesView(
             origin=origin,
             name=name,
             axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
+            plot_legend=rrb.PlotLegend(corner=legend),
         )
 
     return rrb.Horizontal(
         plot("plots/aerial_rate", "Count rate, air [1/s]", record.span("aerial")),
         plot("plots/ground_rate", "Count rate, ground [1/s]", record.span("ground")),
-        rrb.Tabs(plot("plots/battery", "Battery [%]", whole), plot("plots/height", "Height above ground [m]", whole)),
+        rrb.Tabs(
+            plot("plots/battery", "Battery [%]", whole, rrb.Corner2D.LeftBottom),  # full ones start in the left top
+            plot("plots/height", "Height above ground [m]", whole, rrb.Corner2D.RightTop),
+        ),
     )
 
 

@@ -55,7 +55,7 @@ def write_recording(record: MissionRecord, site_model: SiteModel, path: Path) ->
         }
         _send_site(stream, site_model)
         for vehicle, colour in zip(record.vehicles, vehicle_colours(record), strict=True):
-            _send_vehicle(stream, vehicle, colour)
+            _send_vehicle(stream, vehicle, colour, min(phase.start_s for phase in record.phases))
             _send_vehicle_plots(stream, vehicle, colour, site_model)
         for phase, part in (("aerial", aerial), ("ground", ground)):
             _send_measurements(stream, record, phase, part, scales[phase])
@@ -110,14 +110,21 @@ def _thinned(time_s: NDArray[np.floating], rate_hz: float) -> NDArray[np.intp]:
     return np.unique(np.r_[np.arange(0, len(time_s), stride), len(time_s) - 1])
 
 
-def _send_vehicle(stream: rr.RecordingStream, vehicle: VehicleRecord, colour: str) -> None:
-    """Pose, body and label below ``world/vehicles``, and the trail that grows with time."""
+def _send_vehicle(stream: rr.RecordingStream, vehicle: VehicleRecord, colour: str, start_s: float) -> None:
+    """Pose, body and label below ``world/vehicles``, and the trail that grows with time.
+
+    A vehicle whose track begins after the mission, at ``start_s``, waits until then where its track begins; without a
+    pose it would be drawn at the origin of the site.
+    """
     path = path_of("world/vehicles", vehicle.name)
     keep = _thinned(vehicle.time_s, POSE_RATE_HZ)
+    time = vehicle.time_s[keep]
+    if len(keep) and time[0] > start_s:
+        keep, time = np.r_[keep[0], keep], np.r_[start_s, time]
     xyzw = vehicle.quaternion[keep][:, [1, 2, 3, 0]]
     stream.send_columns(
         path,
-        _times(vehicle.time_s[keep]),
+        _times(time),
         rr.Transform3D.columns(translation=vehicle.position_m[keep], quaternion=xyzw),
     )
     body = vehicle_mesh(vehicle, colour, BODY_SCALE[vehicle.kind])
@@ -201,7 +208,7 @@ def _send_measurements(
 ) -> None:
     """Every sample as a point where the crystal was, coloured by the 1 s mean rate; a row for each second."""
     colours = scale(smoothed_rate(samples))
-    radius = 0.45 if phase == "aerial" else 0.22
+    radius = 0.45 if phase == "aerial" else 0.35
     for index in np.unique(samples.vehicle):
         mine = np.flatnonzero(samples.vehicle == index)
         time = samples.time_s[mine]

@@ -24,7 +24,7 @@ def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: 
     stream.set_time(TIMELINE, duration=float(record.survey_end_s))
     _hotspots_and_route(stream, record, site_model)
     if record.aerial_estimate is not None:
-        _estimate(stream, "estimate/aerial", record.aerial_estimate, "from the air", _AERIAL_ESTIMATE)
+        _estimate(stream, "estimate/aerial", record.aerial_estimate, "aerial", _AERIAL_ESTIMATE)
     stream.set_time(TIMELINE, duration=float(record.end_s))
     if record.estimate is not None:
         _estimate(stream, "estimate/final", record.estimate, "final", ESTIMATE)
@@ -45,7 +45,8 @@ def _hotspots_and_route(stream: rr.RecordingStream, record: MissionRecord, site_
         stream.log("world/hotspots", rr.LineStrips3D(rings, colors=[_HOTSPOT], radii=thin))
     if len(record.route_m) > 1:
         lifted = record.route_m + np.array([0.0, 0.0, _ROUTE_ABOVE_GROUND_M])
-        stream.log("world/route", rr.LineStrips3D([lifted], colors=[_ROUTE], radii=thin))
+        # Thinner than the samples taken along it, which it would hide.
+        stream.log("world/route", rr.LineStrips3D([lifted], colors=[_ROUTE], radii=rr.Radius.ui_points(0.6)))
 
 
 def _pin(

@@ -100,6 +100,20 @@ def test_poses_are_those_of_the_record_at_ten_hertz(recording: Recording, found:
         np.testing.assert_allclose(wxyz, vehicle.quaternion[keep], atol=1e-5)
 
 
+def test_vehicle_of_a_later_phase_waits_where_it_will_start(
+    found: MissionRecord, site: SiteModel, tmp_path: Path
+) -> None:
+    *flying, rover = found.vehicles
+    late = np.flatnonzero(rover.time_s > found.phases[1].start_s)
+    arrays = ("time_s", "position_m", "quaternion", "velocity_m_s", "energy_wh", "battery_fraction")
+    rover = dataclasses.replace(rover, **{name: getattr(rover, name)[late] for name in arrays})
+    path = tmp_path / "late.rrd"
+    write_recording(dataclasses.replace(found, vehicles=(*flying, rover)), site, path)
+    times, positions = Recording(path).rows(f"/world/vehicles/{rover.name}", "Transform3D:translation")
+    assert times[:2] == pytest.approx([found.phases[0].start_s, rover.time_s[0]])
+    np.testing.assert_allclose(np.array(positions)[:2, 0], rover.position_m[[0, 0]], atol=1e-4)
+
+
 def test_every_vehicle_has_a_solid_body_and_its_name(recording: Recording, found: MissionRecord) -> None:
     for vehicle in found.vehicles:
         _, (triangles,) = recording.rows(f"/world/vehicles/{vehicle.name}/body", "Mesh3D:triangle_indices")
@@ -171,15 +185,14 @@ def test_map_has_triangles_whenever_it_has_points(recording: Recording, found: M
             assert np.max(triangles) < points == len(seen["vertex_colors"])
 
 
-def test_survey_too_short_for_a_map_is_recorded_without_one(
+def test_survey_that_missed_the_map_is_recorded_without_one(
     found: MissionRecord, site: SiteModel, tmp_path: Path
 ) -> None:
     unknown = dataclasses.replace(found.map, mean_cps=np.full_like(found.map.mean_cps, np.nan))
-    aerial = np.flatnonzero(found.samples.phase == "aerial")[:1]
-    names = [field.name for field in dataclasses.fields(found.samples)]
-    one = dataclasses.replace(found.samples, **{name: getattr(found.samples, name)[aerial] for name in names})
-    path = tmp_path / "short.rrd"
-    write_recording(dataclasses.replace(found, map=unknown, samples=one), site, path)
+    away = dataclasses.replace(found.samples, position_m=found.samples.position_m + np.array([1e3, 0.0, 0.0]))
+    path = tmp_path / "away.rrd"
+    write_recording(dataclasses.replace(found, map=unknown, samples=away), site, path)
+    assert verify(path).returncode == 0
     assert "/world/map" not in Recording(path).tables
 
 
