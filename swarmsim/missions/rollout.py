@@ -9,20 +9,21 @@ import numpy as np
 
 from swarmsim.config.scenario import Scenario
 from swarmsim.estimation import Measurements
-from swarmsim.missions import events, keys, knowledge
-from swarmsim.missions.batching import Axes, batched, one_by_one, shards_of, spread
+from swarmsim.missions import events, keys
+from swarmsim.missions.batching import Axes, shards_of
 from swarmsim.missions.drive import Drive
 from swarmsim.missions.flight import Flight
-from swarmsim.missions.knowledge import AerialKnowledge, GroundKnowledge, learn_from_ground
+from swarmsim.missions.knowledge import AerialKnowledge, GroundKnowledge
 from swarmsim.missions.measure import Log
 from swarmsim.missions.progress import Progress, SilentProgress
 from swarmsim.missions.simulation import Dynamics
 from swarmsim.missions.stage import Clock, Stage
+from swarmsim.missions.stages import Stages, batch_stage
 from swarmsim.missions.world import Roles, World, build_timing, build_world, roles_of
 from swarmsim.policies.path import Path
 from swarmsim.site import SiteModel
 
-SEGMENT_TICKS = 256  # between two looks at the progress
+SEGMENT_TICKS = 256  # ticks of the UAVs between two looks at the progress
 ROVER_SEGMENT_S = 12.0  # the same for the rover, in simulated time
 
 
@@ -83,8 +84,8 @@ class Simulation:
         self.world: World = build_world(scenario, site_model, self.roles)
         self.dynamics = Dynamics(scenario, self.roles, self.timing)
         self.clock = Clock()
-        self._stages: dict[tuple[str, int], Stage] = {}
-        self._per_window = max(1, round(scenario.mission.localisation.window_s / self.timing.uav_tick_s))
+        self._stages: dict[int, Stages] = {}
+        self._single: dict[tuple[str, int], Stage] = {}
 
     @property
     def nuclide_names(self) -> tuple[str, ...]:
@@ -97,77 +98,46 @@ class Simulation:
         seeds = np.atleast_1d(np.asarray(seeds, np.int64))
         self.clock.reset()
         # every device flies as many: the last seed fills up, and its copies are not looked at
-        shards = shards_of(len(seeds))
-        filled = np.append(seeds, np.repeat(seeds[-1], -len(seeds) % shards))
+        filled = np.append(seeds, np.repeat(seeds[-1], -len(seeds) % shards_of(len(seeds))))
         mission_keys = keys.mission_keys(filled)
-        aerial = self._survey(mission_keys, tell)
-        ground = None if self.world.rover is None else self._search(mission_keys, aerial, tell)
-        return MissionBatch(seeds=seeds, aerial=aerial, ground=ground, clock=self.clock)
+        do = self.stages(len(filled))
+        aerial = self._survey(do, mission_keys, tell)
+        ground = None if self.world.rover is None else self._search(do, mission_keys, aerial, tell)
+        return MissionBatch(seeds=seeds, aerial=aerial, ground=ground, clock=self.clock.copy())
 
-    def _survey(self, mission_keys: jax.Array, tell: Progress) -> Aerial:
-        missions, per_window = len(mission_keys), self._per_window
-        starts = self.scenario.mission.localisation.starts
-        plan = self.stage("plan the survey", self.dynamics.plan_survey, (None,), missions)
-        ready = self.stage("take off", self.dynamics.ready_to_fly, (0, None), missions)
-        fly = self.stage("fly", self.dynamics.fly, (0, None, 0, 0, None), missions)
-        count = self.stage("count", knowledge.count_from_air, (0, None, 0), missions, in_step=False)
-        learn = self.stage(
-            "learn from the air",
-            lambda world, counts: knowledge.learn_from_air(world, counts, per_window, starts),
-            (None, 0), missions, in_step=False,
-        )  # fmt: skip
-        paths = plan(self.world)
-        flights, log = self._segments(
-            "aerial survey", tell, self.scenario.mission.aerial.time_limit_s, self.timing.uav_tick_s, SEGMENT_TICKS,
-            lambda state, ticks: fly(mission_keys, self.world, paths, state, ticks), ready(mission_keys, self.world),
+    def _survey(self, do: Stages, key: jax.Array, tell: Progress) -> Aerial:
+        """Phase 1: plan, fly until every UAV has landed, map the counts and estimate the source."""
+        world = self.world
+        limit = self.scenario.mission.aerial.time_limit_s
+        paths = do.plan_survey(world)
+        flights, log = self._until_ended(
+            "aerial survey", tell, limit, self.timing.uav_tick_s, SEGMENT_TICKS,
+            lambda flights, ticks: do.fly(key, world, paths, flights, ticks), do.ready_to_fly(key, world),
         )  # fmt: skip
         tell.phase("map and estimate", 0.0)
-        measurements = count(mission_keys, self.world, log)
-        learned = learn(self.world, measurements)
-        return Aerial(
-            paths=paths,
-            flights=flights,
-            log=log,
-            measurements=measurements,
-            knowledge=learned,
-            end_s=_end(flights.event_time_s, log.time_s).max(axis=1),
-        )
+        counts = do.count_from_air(key, world, log)
+        known = do.learn_from_air(world, counts)
+        end = _end(flights.event_time_s, log.time_s).max(axis=1)
+        return Aerial(paths=paths, flights=flights, log=log, measurements=counts, knowledge=known, end_s=end)
 
-    def _search(self, mission_keys: jax.Array, aerial: Aerial, tell: Progress) -> Ground:
-        missions, per_window, per_sample = len(mission_keys), self._per_window, self.timing.rover_ticks
-        plan = self.stage("plan the route", self.dynamics.plan_route, (None, 0, 0), missions, in_step=False)
-        ready = self.stage("set out", self.dynamics.ready_to_drive, (None, 0), missions)
-        drive = self.stage("drive", self.dynamics.drive, (None, 0, 0, None), missions)
-        count = self.stage(
-            "count on the ground",
-            lambda key, world, log: knowledge.count_on_ground(key, world, log, per_sample),
-            (0, None, 0), missions, in_step=False,
-        )  # fmt: skip
-        learn = self.stage(
-            "learn from the ground",
-            lambda key, world, known, air, counts: learn_from_ground(key, world, known, air, counts, per_window),
-            (0, None, 0, 0, 0), missions, in_step=False,
-        )  # fmt: skip
+    def _search(self, do: Stages, key: jax.Array, aerial: Aerial, tell: Progress) -> Ground:
+        """Phase 3: route the rover to the estimate, drive, identify the nuclide and refine the estimate."""
+        world, timing, known = self.world, self.timing, aerial.knowledge
+        limit = self.scenario.mission.ground.time_limit_s
+        samples = max(1, round(ROVER_SEGMENT_S / (timing.rover_ticks * timing.rover_tick_s)))
         tell.phase("plan the route", 0.0)
-        route = plan(self.world, aerial.knowledge.fit.position_m[:, :2], aerial.knowledge.found)
-        segment = per_sample * max(1, round(ROVER_SEGMENT_S / (per_sample * self.timing.rover_tick_s)))
-        rover, log = self._segments(
-            "ground search", tell, self.scenario.mission.ground.time_limit_s, self.timing.rover_tick_s, segment,
-            lambda state, ticks: drive(self.world, route, state, ticks), ready(self.world, aerial.end_s),
+        route = do.plan_route(world, known.fit.position_m[:, :2], known.found)
+        rover, log = self._until_ended(
+            "ground search", tell, limit, timing.rover_tick_s, samples * timing.rover_ticks,
+            lambda rover, ticks: do.drive(world, route, rover, ticks), do.ready_to_drive(world, aerial.end_s),
         )  # fmt: skip
         tell.phase("identify and refine", 0.0)
-        measurements = count(mission_keys, self.world, log)
-        learned = learn(mission_keys, self.world, aerial.knowledge, aerial.measurements, measurements)
-        return Ground(
-            route=route,
-            rover=rover,
-            log=log,
-            measurements=measurements,
-            knowledge=learned,
-            end_s=_end(rover.event_time_s, log.time_s),
-        )
+        counts = do.count_on_ground(key, world, log)
+        learned = do.learn_from_ground(key, world, known, aerial.measurements, counts)
+        end = _end(rover.event_time_s, log.time_s)
+        return Ground(route=route, rover=rover, log=log, measurements=counts, knowledge=learned, end_s=end)
 
-    def _segments(
+    def _until_ended(
         self, name: str, tell: Progress, limit_s: float, tick_s: float, ticks: int, advance: Any, state: Any
     ) -> tuple[Any, Log]:
         """Advance by segments until every vehicle of every mission has ended its part, or the time is up."""
@@ -182,19 +152,19 @@ class Simulation:
                 break
         return state, jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *logs)
 
-    def stage(
-        self, name: str, function: Any, axes: Axes, missions: int, *, in_step: bool = True, out_axes: Any = 0
-    ) -> Stage:
-        """The compiled form for a number of missions of a function of one: ``axes`` tells which arguments are theirs.
+    def stages(self, missions: int) -> Stages:
+        """The compiled steps of a batch of so many missions, kept for the life of the simulation."""
+        if missions not in self._stages:
+            localisation = self.scenario.mission.localisation
+            per_window = max(1, round(localisation.window_s / self.timing.uav_tick_s))
+            self._stages[missions] = Stages(self.dynamics, missions, localisation.starts, per_window, self.clock)
+        return self._stages[missions]
 
-        ``in_step`` missions are vmapped, else they run one after the other. What is compiled is kept for the life of
-        the simulation.
-        """
-        if (name, missions) not in self._stages:
-            shards = shards_of(missions) if out_axes == 0 else 1
-            part = batched(function, axes, missions // shards, out_axes) if in_step else one_by_one(function, axes)
-            self._stages[name, missions] = Stage(name, spread(part, axes, shards), self.clock)
-        return self._stages[name, missions]
+    def stage(self, name: str, function: Any, axes: Axes, missions: int, out_axes: Any = 0) -> Stage:
+        """One more compiled function of a batch, kept under its name (see `batch_stage`)."""
+        if (name, missions) not in self._single:
+            self._single[name, missions] = batch_stage(name, function, axes, missions, self.clock, out_axes=out_axes)
+        return self._single[name, missions]
 
 
 def _end(event_time_s: jax.Array, log_time_s: jax.Array) -> jax.Array:

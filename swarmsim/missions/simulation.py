@@ -1,6 +1,6 @@
-"""The one place where vehicles and missions are batched: pure functions of one mission, vmapped and compiled.
+"""One mission's functions: its vehicles batched, its engines and policies chosen.
 
-Everything below this module is written for one vehicle in one mission.
+Everything below is written for one vehicle; `swarmsim.missions.stages` batches these functions over missions.
 """
 
 from collections.abc import Callable

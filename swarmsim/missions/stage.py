@@ -18,6 +18,12 @@ class Clock:
         self.compiled: dict[str, float] = {}
         self.ran: dict[str, float] = {}
 
+    def copy(self) -> "Clock":
+        """The times as they stand now."""
+        taken = Clock()
+        taken.compiled, taken.ran = dict(self.compiled), dict(self.ran)
+        return taken
+
     @property
     def compile_s(self) -> float:
         """Seconds spent compiling."""

@@ -70,13 +70,9 @@ class Stepper:
         simulation, world = self._simulation, self._simulation.world
         mission_keys = keys.mission_keys(np.atleast_1d(np.asarray(seeds, np.int64)))
         missions = len(mission_keys)
-        flights = simulation.stage("take off", simulation.dynamics.ready_to_fly, (0, None), missions)(
-            mission_keys, world
-        )
-        rover = None
-        if world.rover is not None:
-            ready = simulation.stage("set out", simulation.dynamics.ready_to_drive, (None, 0), missions)
-            rover = ready(world, jnp.zeros(missions))
+        do = simulation.stages(missions)
+        flights = do.ready_to_fly(mission_keys, world)
+        rover = None if world.rover is None else do.ready_to_drive(world, jnp.zeros(missions))
         return TeamState(key=mission_keys, tick=jnp.int32(0), flights=flights, rover=rover)
 
     def hold(self, state: TeamState) -> Command:
