@@ -21,7 +21,7 @@ DESCRIPTIONS = {
 
 def none_yet() -> jax.Array:
     """Event times [kinds] of a vehicle to which nothing has happened: infinity."""
-    return jnp.full(len(KINDS), jnp.inf)
+    return jnp.full(len(KINDS), jnp.inf, jnp.float32)  # without the type the first tick would compile twice
 
 
 def record(times_s: jax.Array, happened: jax.Array, now_s: jax.Array) -> jax.Array:
