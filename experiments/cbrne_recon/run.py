@@ -6,13 +6,13 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import swarmsim  # isort: skip - before jax, whose log it quiets
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-import swarmsim
 from swarmsim.missions.progress import RichProgress
 from swarmsim.missions.summary import batch_row
 from swarmsim.radiation import net_rate
