@@ -80,14 +80,19 @@ def test_uavs_fly_the_lines_at_the_height_above_ground(simulation, records):
 def test_mission_k_of_a_batch_is_the_mission_of_its_seed(simulation, batch, records):
     alone = swarmsim.mission_record(simulation, simulation.rollout(6), 0)
     together = records[1]
-    # single and batched programs round differently; contact and feedback keep the difference small, not zero
+    # Programs of different batch sizes round differently. Flight and aerial counts stay alike to millimetres; the
+    # estimate's search then ends within its uncertainty, and the route, planned on cells of 1 m, may move by one of them.
     for one, other in zip(alone.vehicles, together.vehicles, strict=True):
         count = min(len(one.time_s), len(other.time_s))
-        assert abs(len(one.time_s) - len(other.time_s)) <= 2
-        np.testing.assert_allclose(one.position_m[:count], other.position_m[:count], atol=0.05)
-    assert np.mean(alone.samples.counts != together.samples.counts) < 0.02
-    np.testing.assert_allclose(alone.estimate.position_m, together.estimate.position_m, atol=0.1)
-    assert alone.estimate.activity_mbq == pytest.approx(together.estimate.activity_mbq, rel=0.02)
+        tolerance = 0.01 if one.kind == "multirotor" else 1.5
+        np.testing.assert_allclose(one.position_m[:count], other.position_m[:count], atol=tolerance)
+    counts = [record.samples.of_phase("aerial").counts for record in (alone, together)]
+    assert len(counts[0]) == len(counts[1])
+    assert np.mean(counts[0] != counts[1]) < 0.005
+    spread = np.sqrt(np.diag(alone.aerial_estimate.covariance_m2))
+    assert np.all(np.abs(alone.aerial_estimate.position_m - together.aerial_estimate.position_m) < spread)
+    np.testing.assert_allclose(alone.estimate.position_m[:2], together.estimate.position_m[:2], atol=0.1)
+    assert alone.estimate.activity_mbq == pytest.approx(together.estimate.activity_mbq, rel=0.05)
     assert alone.spectrum.nuclide == together.spectrum.nuclide
 
 
