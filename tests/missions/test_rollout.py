@@ -81,7 +81,7 @@ def test_mission_k_of_a_batch_is_the_mission_of_its_seed(simulation, batch, reco
     alone = swarmsim.mission_record(simulation, simulation.rollout(6), 0)
     together = records[1]
     # Programs of different batch sizes round differently. Flight and aerial counts stay alike to millimetres; the
-    # estimate's search then ends within its uncertainty, and the route, planned on cells of 1 m, may move by one of them.
+    # search for the estimate then ends within its uncertainty, and the route, planned in cells of 1 m, may move by one.
     for one, other in zip(alone.vehicles, together.vehicles, strict=True):
         count = min(len(one.time_s), len(other.time_s))
         tolerance = 0.01 if one.kind == "multirotor" else 1.5
