@@ -105,6 +105,19 @@ def test_one_by_one_equals_in_step_and_spread(missions):
         np.testing.assert_allclose(a, c, rtol=1e-6)
 
 
+def test_a_batch_spread_over_devices_equals_one_on_one_device():
+    def until_small(x, limit):
+        return jax.lax.while_loop(lambda v: v > limit, lambda v: 0.5 * v, x)
+
+    assert len(jax.devices()) == 2
+    x = jnp.array([1.0, 1000.0, 3.0, 1e6])
+    part = batched(until_small, (0, None), 2)
+    over = jax.jit(spread(part, (0, None), 2))(x, 0.7)
+    alone = jax.jit(batched(until_small, (0, None), 4))(x, 0.7)
+    np.testing.assert_array_equal(over, alone)
+    assert len(over.sharding.device_set) == 2
+
+
 def test_a_batch_is_spread_only_where_every_device_gets_two():
     devices = len(jax.devices())
     assert shards_of(1) == 1
