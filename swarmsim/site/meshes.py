@@ -76,7 +76,8 @@ def _sound(part: Part) -> bool:
 def _read_collada(path: Path) -> tuple[float, str, list[Part]]:
     import collada
 
-    with warnings.catch_warnings():  # pycollada multiplies with numpy.matrix
+    with warnings.catch_warnings():  # pycollada multiplies with numpy.matrix and sets the shape of arrays
+        warnings.filterwarnings("ignore", "Setting the shape", DeprecationWarning)
         warnings.simplefilter("ignore", PendingDeprecationWarning)
         ignored = [collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
         return _collada_scene(collada.Collada(str(path), ignore=ignored), path)
