@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, PositiveVec3, Vec3
+from swarmsim.config.base import Model, Name, NonNegative, Positive, PositiveVec3, Vec3
 from swarmsim.config.radiation import DetectorMount
 
 
@@ -237,4 +237,3 @@ class SkidSteer(Sourced):
 
 
 Vehicle = Annotated[Multirotor | SkidSteer, Field(discriminator="kind")]
-__all__ = ["Battery", "Fraction", "Multirotor", "SkidSteer", "Vehicle"]

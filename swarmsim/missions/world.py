@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swarmsim.config.errors import InputError
+from swarmsim.config.radiation import DetectorMount
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.estimation import LocalisationParams, MappingParams, localisation_params, mapping_params
@@ -151,7 +152,7 @@ def _periods(scenario: Scenario, vehicle: int, period_s: float) -> int:
     return count
 
 
-def _mount(scenario: Scenario, vehicle: int):  # type: ignore[no-untyped-def]
+def _mount(scenario: Scenario, vehicle: int) -> DetectorMount:
     mount = scenario.vehicles[vehicle].detector
     if mount is None:
         member = scenario.mission.vehicles[vehicle]
