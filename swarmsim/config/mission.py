@@ -66,18 +66,21 @@ class Mapping(Model):
 
 
 class Localisation(Model):
-    """Phase 2b and 3b: maximum-likelihood estimate of position and activity."""
+    """Phase 2b and 3b: estimate of position and activity from the likelihood of the counts."""
 
     presumed_nuclide: Name
     presumed_height_m: float = Field(ge=-5, le=100)
     height_std_m: NonNegative
     window_s: Positive
+    rays_per_window: int = Field(default=3, ge=1, le=32)
     starts: int = Field(ge=1, le=64)
     iterations: int = Field(ge=10, le=10_000)
     learning_rate_m: Positive
     search_radius_m: Positive = 6.0
-    search_rounds: int = Field(default=12, ge=0, le=1000)
+    search_rounds: int = Field(default=3, ge=0, le=1000)
     fisher_steps: int = Field(default=6, ge=1, le=100)
+    sample_rounds: int = Field(default=6, ge=1, le=100)
+    samples: int = Field(default=64, ge=16, le=10_000)
 
 
 class Ground(Model):

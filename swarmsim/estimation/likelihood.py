@@ -11,15 +11,15 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.estimation.measurements import Measurements, cleared
-from swarmsim.pytree import pytree
+from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector, Source, net_rate, observed_rate
-from swarmsim.site import Site, path_lengths, sample, sample_with_gradient
+from swarmsim.site import Site, sample, sample_with_gradient
+from swarmsim.site.horizon import Ceilings, ceilings, path_lengths_from
 
 STEP_SHARE = 0.05  # step of the central differences over the distance of the nearest window: a relative error of 0.25 %
 STEP_M = (0.02, 1.0)  # shortest and longest step
 MEAN_FLOOR = 1e-6  # counts; keeps a zero-rate model finite when it meets a count
 FIXED_STD_M = 1e-3  # a height known better than this counts as known this well
-BLOCK = 128  # windows evaluated together: their rays through all boxes stay in the cache, and bound memory in batches
 
 
 @pytree
@@ -27,12 +27,14 @@ class FitProblem:
     """Everything a likelihood is conditioned on."""
 
     site: Site
+    above: Ceilings  # of the site
     detectors: tuple[Detector, ...]
     measurements: Measurements
     nuclide: jax.Array  # [] int32 index in the library's order
     extra_cps: jax.Array  # [n] net rate of other, known sources
     height_m: jax.Array  # [] prior mean of the height above ground
     height_std_m: jax.Array  # [] prior standard deviation
+    rays: int = static()  # to a window, along its way
 
 
 @pytree
@@ -51,19 +53,40 @@ def position_of(site: Site, theta: jax.Array) -> jax.Array:
 
 
 def net_rates(
-    site: Site, detectors: tuple[Detector, ...], m: Measurements, position_m: jax.Array, nuclide: jax.Array
+    site: Site,
+    detectors: tuple[Detector, ...],
+    m: Measurements,
+    position_m: jax.Array,
+    nuclide: jax.Array,
+    above: Ceilings | None = None,
+    rays: int = 1,
 ) -> jax.Array:
-    """Net rate [n] in counts/s per becquerel of a source at ``position_m`` [3] in each measurement's detector."""
+    """Net rate [n] in counts/s per becquerel of a source at ``position_m`` [3] in each measurement's detector.
+
+    The mean over the way of the crystal during the measurement, by a ray to the middle of each of ``rays`` equal parts
+    of it: between them, 1/r² is integrated in closed form and the rest taken as constant. ``above`` is the site's
+    pyramid of `ceilings`, where the caller has it already.
+    """
+    above = ceilings(site) if above is None else above
     source = Source(position_m=position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
+    middle = (jnp.arange(rays) + 0.5) / rays - 0.5
+    crystal = (m.position_m[:, None] + middle[:, None] * m.travel_m[:, None]).reshape(-1, 3)
+    axis, way, which = (jnp.repeat(x, rays, axis=0) for x in (m.axis, m.travel_m / rays, m.detector))
+    lengths = path_lengths_from(site, above, position_m, crystal)
 
-    def one(window: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        crystal, axis, which = window
-        lengths = path_lengths(site, position_m, crystal)
-        rates = [net_rate(d, source, lengths, crystal, axis) for d in detectors]
-        return _of_detector(rates, which)
+    def rate(detector: Detector) -> jax.Array:
+        each = jax.vmap(lambda through, place, axis: net_rate(detector, source, through, place, axis))
+        return each(lengths, crystal, axis)
 
-    rates = jax.lax.map(one, (m.position_m, m.axis, m.detector), batch_size=BLOCK)
-    return rates * travel_gain(m.position_m - position_m, m.travel_m)
+    rates = _of_detector([rate(d) for d in detectors], which) * travel_gain(crystal - position_m, way)
+    return jnp.mean(rates.reshape(-1, rays), axis=1)
+
+
+def exact_rates(problem: FitProblem, position_m: jax.Array) -> jax.Array:
+    """Net rate [n] per becquerel of the source sought at ``position_m`` [3]."""
+    return net_rates(
+        problem.site, problem.detectors, problem.measurements, position_m, problem.nuclide, problem.above, problem.rays
+    )
 
 
 def travel_gain(offset_m: jax.Array, travel_m: jax.Array) -> jax.Array:
@@ -134,7 +157,7 @@ def evaluate(problem: FitProblem, theta: jax.Array) -> Evaluation:
     half = jnp.clip(STEP_SHARE * jnp.min(jnp.where(m.valid, apart, jnp.inf)), *STEP_M)
     steps = half * jnp.concatenate([jnp.zeros((1, 3)), jnp.eye(3), -jnp.eye(3)])
     places = jax.vmap(lambda d: position_of(problem.site, theta[:3] + d))(steps)
-    rates = jax.lax.map(lambda p: net_rates(problem.site, problem.detectors, m, p, problem.nuclide), places)
+    rates = jax.lax.map(lambda place: exact_rates(problem, place), places)
     activity = jnp.exp(theta[3])
     toward = activity * (rates[1:4] - rates[4:]) / (2.0 * half)
 
@@ -171,6 +194,7 @@ def fisher_information(
     nuclide: jax.Array,
     background_scale: jax.Array | float = 1.0,
     extra_rate_cps: jax.Array | float = 0.0,
+    rays: int = 1,
 ) -> jax.Array:
     """Fisher information [5, 5] that samples hold about a source; only where and how long they were taken matters.
 
@@ -183,6 +207,7 @@ def fisher_information(
         nuclide: [] int32 index in the library's order.
         background_scale: [] true background over the nominal one.
         extra_rate_cps: [] or [n] net rate of other sources.
+        rays: to each measurement, along its way (static).
 
     Returns:
         Information about (x m, y m, height above ground m, log activity, log background scale), without any prior.
@@ -193,12 +218,14 @@ def fisher_information(
     theta = jnp.stack([position_m[0], position_m[1], height, jnp.log(activity_bq), jnp.log(scale)])
     problem = FitProblem(
         site=site,
+        above=ceilings(site),
         detectors=detectors,
         measurements=cleared(measurements),
         nuclide=nuclide,
         extra_cps=jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), measurements.counts.shape),
         height_m=height,
         height_std_m=jnp.asarray(jnp.inf, jnp.float32),
+        rays=rays,
     )
     return evaluate(problem, theta).information
 

@@ -1,8 +1,9 @@
-"""Maximum-likelihood localisation of one point source with the full forward model of the measurement.
+"""Localisation of one point source by the likelihood of the counts, with the full forward model of the measurement.
 
 A search from several starts (`swarmsim.estimation.search`) ends near the largest likelihood; damped Fisher scoring
-(Levenberg–Marquardt on the Poisson likelihood, Osborne 1992) goes the rest of the way. Every evaluation of the latter
-uses exact path lengths, so its fixed point and its covariance are those of the exact likelihood.
+(Levenberg–Marquardt on the Poisson likelihood, Osborne 1992) goes the rest of the way. Places drawn round that maximum
+give the estimate, the mean of the posterior, and its covariance (`swarmsim.estimation.posterior`); in the open they are
+the maximum and the inverse of the information there.
 """
 
 import jax
@@ -18,6 +19,7 @@ from swarmsim.estimation.likelihood import (
     scaled_inverse,
 )
 from swarmsim.estimation.measurements import Measurements, cleared
+from swarmsim.estimation.posterior import Posterior, sample_posterior
 from swarmsim.estimation.search import (
     LOG_STEP,
     Bounds,
@@ -29,9 +31,10 @@ from swarmsim.estimation.search import (
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector
 from swarmsim.site import Site
+from swarmsim.site.horizon import ceilings
 
 POSITION_STEP_M = 10.0  # longest Fisher step of a coordinate
-SETTLED_NATS = 0.02  # gain of the last Fisher steps below which the fit has converged: 0.2 standard deviations
+ENOUGH_EFFECTIVE = 4.0  # weighted places must be worth this many: the mean is then within half a standard deviation
 
 
 @pytree
@@ -45,22 +48,26 @@ class LocalisationParams:
     iterations: int = static()  # of Adam
     search_rounds: int = static()  # of the pattern search
     fisher_steps: int = static()  # of the polish
+    sample_rounds: int = static()  # of the posterior's places
+    samples: int = static()  # places in a round
+    rays: int = static()  # to a window, along its way
 
 
 @pytree
 class SourceFit:
-    """The estimate of one source, with uncertainties from the Fisher information at the optimum (prior included)."""
+    """The estimate of one source: mean and covariance of the posterior."""
 
     position_m: jax.Array  # [3] m, world ENU
     activity_bq: jax.Array  # []
     background_scale: jax.Array  # [] background over the detectors' nominal one
     covariance_m2: jax.Array  # [3, 3] of the position; bounded by the site's size where the data say nothing
     activity_std_bq: jax.Array  # []
-    log_likelihood: jax.Array  # [] nats, relative to the saturated model
+    log_likelihood: jax.Array  # [] nats, relative to the saturated model, at its maximum
     log_likelihood_background_only: jax.Array  # [] the same without a source, background scale fitted
     detection: jax.Array  # [] twice their difference: generalised likelihood ratio, see `detected`
     reduced_deviance: jax.Array  # [] about 1 for a model that describes the counts; tens: a local optimum, more sources
-    converged: jax.Array  # [] bool: the last steps gained nothing, and the place is within the site
+    effective_samples: jax.Array  # [] number of independent places that the posterior's weighted ones are worth
+    converged: jax.Array  # [] bool: those are enough for a mean, and the place is within the site
 
 
 def localisation_params(spec: Localisation) -> LocalisationParams:
@@ -73,6 +80,9 @@ def localisation_params(spec: Localisation) -> LocalisationParams:
         iterations=spec.iterations,
         search_rounds=spec.search_rounds,
         fisher_steps=spec.fisher_steps,
+        sample_rounds=spec.sample_rounds,
+        samples=spec.samples,
+        rays=spec.rays_per_window,
     )
 
 
@@ -101,21 +111,29 @@ def localise(
     """
     m = cleared(measurements)
     extra = jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), m.counts.shape)
+    # Windows near the ground next to one another: only their rays need to be followed through the terrain.
+    low_first = jnp.argsort(m.position_m[:, 2])
+    m, extra = jax.tree.map(lambda leaf: leaf[low_first], (m, extra))
     problem = FitProblem(
         site=site,
+        above=ceilings(site),
         detectors=detectors,
         measurements=m,
         nuclide=nuclide,
         extra_cps=jnp.where(m.valid, extra, 0.0),
         height_m=params.presumed_height_m,
         height_std_m=params.height_std_m,
+        rays=params.rays,
     )
     limits = bounds(problem)
     log_scale, without_source = background_only(problem)
     candidates = gradient_search(problem, limits, initial_xy, log_scale, params.learning_rate_m, params.iterations)
     best = pattern_search(problem, limits, candidates, log_scale, params.search_radius_m, params.search_rounds)
-    theta, found, settled = _polish(problem, limits, best, params.fisher_steps)
-    return _report(problem, limits, theta, found, settled, without_source)
+    theta, found = _polish(problem, limits, best, params.fisher_steps)
+    # Where the data say nothing, a coordinate is known to the range it was sought in: uniform, variance range² / 12.
+    covariance = scaled_inverse(found.information + jnp.diag(12.0 / jnp.square(limits[1] - limits[0])))
+    posterior = sample_posterior(problem, limits, theta, covariance, log_scale, params.sample_rounds, params.samples)
+    return _report(problem, limits, posterior, found, without_source)
 
 
 def detected(fit: SourceFit, significance_sigma: jax.Array | float) -> jax.Array:
@@ -129,18 +147,12 @@ def detected(fit: SourceFit, significance_sigma: jax.Array | float) -> jax.Array
     return fit.detection > jnp.square(significance_sigma)
 
 
-def _polish(
-    problem: FitProblem, limits: Bounds, theta: jax.Array, steps: int
-) -> tuple[jax.Array, Evaluation, jax.Array]:
-    """Second stage: damped Fisher scoring from ``theta`` [5]; the end point, the likelihood there, whether it settled.
-
-    Settled means that the last steps gained nothing, not that the score is zero: at the edge of a wall's shadow the
-    best place is a kink of the likelihood.
-    """
+def _polish(problem: FitProblem, limits: Bounds, theta: jax.Array, steps: int) -> tuple[jax.Array, Evaluation]:
+    """Damped Fisher scoring from ``theta`` [5]: the end point and the likelihood there."""
     reach = jnp.array([POSITION_STEP_M, POSITION_STEP_M, POSITION_STEP_M, LOG_STEP, LOG_STEP])
     Carry = tuple[jax.Array, Evaluation, jax.Array, jax.Array]
 
-    def step(carry: Carry, _: None) -> tuple[Carry, jax.Array]:
+    def step(carry: Carry, _: None) -> tuple[Carry, None]:
         theta, here, damping, trial = carry
         there = evaluate(problem, trial)
         better = there.log_posterior >= here.log_posterior
@@ -149,29 +161,22 @@ def _polish(
         damped = here.information + damping * jnp.diag(jnp.diagonal(here.information))
         move = scaled_inverse(damped) @ here.score
         move = move * jnp.minimum(1.0, jnp.min(reach / jnp.maximum(jnp.abs(move), 1e-9)))
-        return (theta, here, damping, jnp.clip(theta + move, *limits)), here.log_posterior
+        return (theta, here, damping, jnp.clip(theta + move, *limits)), None
 
     unknown = -jnp.asarray(jnp.inf)
     nowhere = Evaluation(
         log_likelihood=unknown, log_posterior=unknown, score=jnp.zeros(5), information=jnp.eye(5)
     )  # worse than any place: the first trial, the start itself, is taken
-    (theta, here, _, _), course = jax.lax.scan(step, (theta, nowhere, jnp.asarray(1e-2), theta), None, length=steps + 1)
-    return theta, here, course[-1] - course[-1 - max(1, steps // 3)] < SETTLED_NATS
+    (theta, here, _, _), _ = jax.lax.scan(step, (theta, nowhere, jnp.asarray(1e-2), theta), None, length=steps + 1)
+    return theta, here
 
 
 def _report(
-    problem: FitProblem,
-    limits: Bounds,
-    theta: jax.Array,
-    here: Evaluation,
-    settled: jax.Array,
-    without_source: jax.Array,
+    problem: FitProblem, limits: Bounds, posterior: Posterior, best: Evaluation, without_source: jax.Array
 ) -> SourceFit:
-    """The fit at the end point ``theta`` [5]."""
+    """The fit of a posterior and the largest likelihood found."""
     low, high = limits
-    # Where the data say nothing, a coordinate is known to the range it was sought in: uniform, variance range² / 12.
-    information = here.information + jnp.diag(12.0 / jnp.square(high - low))
-    covariance = scaled_inverse(information)
+    theta, covariance = posterior.mean, posterior.covariance
     inside = jnp.all((theta[:2] > low[:2]) & (theta[:2] < high[:2]))
     activity = jnp.exp(theta[3])
     return SourceFit(
@@ -180,9 +185,10 @@ def _report(
         background_scale=jnp.exp(theta[4]),
         covariance_m2=position_covariance(problem.site, theta, covariance),
         activity_std_bq=activity * jnp.sqrt(covariance[3, 3]),
-        log_likelihood=here.log_likelihood,
+        log_likelihood=best.log_likelihood,
         log_likelihood_background_only=without_source,
-        detection=jnp.maximum(2.0 * (here.log_likelihood - without_source), 0.0),
-        reduced_deviance=-2.0 * here.log_likelihood / jnp.maximum(jnp.sum(problem.measurements.valid) - 5, 1),
-        converged=settled & inside,
+        detection=jnp.maximum(2.0 * (best.log_likelihood - without_source), 0.0),
+        reduced_deviance=-2.0 * best.log_likelihood / jnp.maximum(jnp.sum(problem.measurements.valid) - 5, 1),
+        effective_samples=posterior.effective,
+        converged=(posterior.effective >= ENOUGH_EFFECTIVE) & inside,
     )

@@ -18,9 +18,9 @@ import optax
 from swarmsim.estimation.likelihood import (
     FIXED_STD_M,
     FitProblem,
+    exact_rates,
     expected_counts,
     height_precision,
-    net_rates,
     observed_rates,
     poisson_log_likelihood,
     position_of,
@@ -76,24 +76,41 @@ def background_only(problem: FitProblem) -> tuple[jax.Array, jax.Array]:
     return log_scale, poisson_log_likelihood(m.counts, expected_counts(problem, none, log_scale), m.valid)
 
 
-def profile(problem: FitProblem, rates: jax.Array, log_scale: jax.Array) -> jax.Array:
-    """Best log activity and log scale [2] at a held position with net rates ``rates`` [n] per becquerel."""
+def profile(problem: FitProblem, rates: jax.Array, log_scale: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Best log activity and log scale [2] at a held position with net rates ``rates`` [n], and their covariance."""
     m = problem.measurements
     # Start where the source gives as much as the background to the windows that see it best.
     brightest = jnp.max(jnp.where(m.valid, rates, 0.0))
     level = observed_rates(problem.detectors, m, jnp.zeros_like(rates), jnp.ones(()))
     start = jnp.log(jnp.maximum(jnp.max(jnp.where(m.valid, level, 0.0)), 1.0) / jnp.maximum(brightest, 1e-20))
 
-    def step(_: int, v: jax.Array) -> jax.Array:
+    Carry = tuple[jax.Array, jax.Array]
+
+    def step(_: int, carry: Carry) -> Carry:
+        v, _covariance = carry
         mean, jacobian = jax.jvp(lambda a: expected_counts(problem, jnp.exp(a) * rates, v[1]), (v[0],), (jnp.ones(()),))
         _, by_scale = jax.jvp(lambda s: expected_counts(problem, jnp.exp(v[0]) * rates, s), (v[1],), (jnp.ones(()),))
         mean = jnp.maximum(mean, 1e-6)
         j = jnp.where(m.valid, jnp.stack([jacobian, by_scale]), 0.0)
         f = (j / mean) @ j.T
-        delta = scaled_inverse(f) @ (j @ ((m.counts - mean) / mean))
-        return jnp.clip(v + jnp.clip(delta, -LOG_STEP, LOG_STEP), *jnp.array([LOG_ACTIVITY, LOG_SCALE]).T)
+        covariance = scaled_inverse(f)
+        delta = covariance @ (j @ ((m.counts - mean) / mean))
+        v = jnp.clip(v + jnp.clip(delta, -LOG_STEP, LOG_STEP), *jnp.array([LOG_ACTIVITY, LOG_SCALE]).T)
+        return v, covariance
 
-    return jax.lax.fori_loop(0, PROFILE_STEPS, step, jnp.stack([jnp.clip(start, *LOG_ACTIVITY), log_scale]))
+    first = jnp.stack([jnp.clip(start, *LOG_ACTIVITY), log_scale])
+    return jax.lax.fori_loop(0, PROFILE_STEPS, step, (first, jnp.eye(2)))
+
+
+def best_at(problem: FitProblem, place: jax.Array, log_scale: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Theta [5] with the activity and background that suit ``place`` [3] (x, y, height above the ground) best, its
+    log posterior [], and the covariance [2, 2] of those two with the place held.
+    """
+    rates = exact_rates(problem, position_of(problem.site, place))
+    nuisance, covariance = profile(problem, rates, log_scale)
+    theta = jnp.concatenate([place, nuisance])
+    value = _log_posterior(problem, theta, jnp.exp(theta[3]) * rates)
+    return theta, jnp.where(jnp.isnan(value), -jnp.inf, value), covariance
 
 
 def gradient_search(
@@ -121,7 +138,7 @@ def gradient_search(
     def segment(carry: Carry, spread: jax.Array) -> tuple[Carry, None]:
         strength = jax.lax.map(lambda t: _strength(problem, t), carry[0])
         rates = jax.vmap(lambda t, s: s / (_squared_distance(problem, t, t) + spread**2))(carry[0], strength)
-        anchor = carry[0].at[:, 3:].set(jax.vmap(lambda r: profile(problem, r, log_scale))(rates))
+        anchor = carry[0].at[:, 3:].set(jax.vmap(lambda r: profile(problem, r, log_scale)[0])(rates))
 
         def iteration(carry: Carry, _: None) -> tuple[Carry, None]:
             theta, memory = carry
@@ -135,15 +152,9 @@ def gradient_search(
     return jax.lax.scan(segment, (theta, optimiser.init(theta)), jnp.array(SPREAD_M))[0][0]
 
 
-def _exact_rates(problem: FitProblem, theta: jax.Array) -> jax.Array:
-    """Net rate [n] per becquerel at ``theta``."""
-    place = position_of(problem.site, theta)
-    return net_rates(problem.site, problem.detectors, problem.measurements, place, problem.nuclide)
-
-
 def _strength(problem: FitProblem, theta: jax.Array) -> jax.Array:
     """Net rate per becquerel times squared distance [n]: what changes slowly with the position."""
-    return _exact_rates(problem, theta) * _squared_distance(problem, theta, theta)
+    return exact_rates(problem, position_of(problem.site, theta)) * _squared_distance(problem, theta, theta)
 
 
 def _squared_distance(problem: FitProblem, theta: jax.Array, anchor: jax.Array) -> jax.Array:
@@ -182,10 +193,7 @@ def pattern_search(
     share = jnp.sqrt((index % OFFSPRING + 0.5) / OFFSPRING)
 
     def fit(place: jax.Array) -> tuple[jax.Array, jax.Array]:
-        rates = _exact_rates(problem, place)
-        theta = jnp.concatenate([place, profile(problem, rates, log_scale)])
-        value = _log_posterior(problem, theta, jnp.exp(theta[3]) * rates)
-        return theta, jnp.where(jnp.isnan(value), -jnp.inf, value)
+        return best_at(problem, place, log_scale)[:2]
 
     def round_(best: tuple[jax.Array, jax.Array], k: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
         reach = reach_m * LAST_REACH ** (k / max(rounds - 1, 1))
@@ -194,11 +202,11 @@ def pattern_search(
         up = height * jnp.minimum(reach, 1.5 * problem.height_std_m)
         offset = jnp.stack([reach * share * jnp.cos(turn), reach * share * jnp.sin(turn), up], axis=-1)
         places = jnp.clip(jnp.repeat(best[0][:, :3], OFFSPRING, axis=0) + offset, low[:3], high[:3])
-        tried = jax.vmap(fit)(places)
+        tried = jax.lax.map(fit, places)
         everyone = [jnp.concatenate(pair) for pair in zip(best, tried, strict=True)]
         value, chosen = jax.lax.top_k(everyone[1], beam)
         return (everyone[0][chosen], value), None
 
-    start = jax.vmap(fit)(candidates[:, :3])
+    start = jax.lax.map(fit, candidates[:, :3])
     (theta, value), _ = jax.lax.scan(round_, start, jnp.arange(rounds))
     return theta[jnp.argmax(value)]

@@ -95,7 +95,7 @@ def learn_from_air(world: World, measurements: Measurements, per_window: int, st
     chart = interpolate(world.mapping, summed)
     hotspots = extract_hotspots(world.mapping, chart)
     places = initial_points(world.mapping, hotspots, starts)
-    fit = localise(world.site, detectors(world), summed, places, world.presumed_nuclide, world.localisation)
+    fit = localise(world.site, detectors(world)[:1], summed, places, world.presumed_nuclide, world.localisation)
     return AerialKnowledge(map=chart, hotspots=hotspots, fit=fit, found=hotspots.valid[0])
 
 

@@ -92,6 +92,11 @@ class Simulation:
         """The library's nuclides, in the order of their indices."""
         return self.world.team.detector.nuclide_names
 
+    @property
+    def per_window(self) -> int:
+        """The UAVs' samples in one window of the estimate."""
+        return max(1, round(self.scenario.mission.localisation.window_s / self.timing.uav_tick_s))
+
     def rollout(self, seeds: Any, progress: Progress | None = None) -> MissionBatch:
         """Fly the missions of ``seeds`` (a number, or a sequence of B) to their end."""
         tell = progress or SilentProgress()
@@ -155,9 +160,8 @@ class Simulation:
     def stages(self, missions: int) -> Stages:
         """The compiled steps of a batch of so many missions, kept for the life of the simulation."""
         if missions not in self._stages:
-            localisation = self.scenario.mission.localisation
-            per_window = max(1, round(localisation.window_s / self.timing.uav_tick_s))
-            self._stages[missions] = Stages(self.dynamics, missions, localisation.starts, per_window, self.clock)
+            starts = self.scenario.mission.localisation.starts
+            self._stages[missions] = Stages(self.dynamics, missions, starts, self.per_window, self.clock)
         return self._stages[missions]
 
     def stage(self, name: str, function: Any, axes: Axes, missions: int, out_axes: Any = 0) -> Stage:

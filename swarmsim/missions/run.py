@@ -25,7 +25,8 @@ def keep_compiled() -> None:
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         folder = Path(platformdirs.user_cache_dir("swarmsim")) / "compiled"
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        # Small programs too: the hundred that build the world take two seconds to compile.
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def build(scenario: Scenario) -> Simulation:

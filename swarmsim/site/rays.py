@@ -9,24 +9,25 @@ GROUND_SAMPLES = 48  # points along a ray at which it is compared with the terra
 _PARALLEL = 1e-9  # a direction component below this, in metres over the whole segment, is parallel to the slab
 
 
-def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
+def path_lengths(site: Site, a: jax.Array, b: jax.Array, soil: jax.Array | None = None) -> jax.Array:
     """Metres [M] of the straight segment from ``a`` [3] to ``b`` [3] (ENU, m) in each of ``site.material_names``.
 
     Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); a hollow box counts its shell alone. The
     ground is what lies below the terrain, followed linearly between `GROUND_SAMPLES` points, so that the length is
     continuous in both ends and differentiable almost everywhere. Where things overlap, their lengths are scaled so that
     the sum never exceeds the distance. The rest of the distance goes to ``air`` if the table has it, and then the sum
-    equals the distance.
+    equals the distance. ``soil`` [] is the fraction below the terrain where it is known already (`ground_fraction`).
     """
     direction = b - a
     squared = jnp.sum(direction * direction)
     distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
-    # one row for each box and one for the ground; a product, because as a sum it would be the dearest part
-    matter = jnp.append(site.obstacles.material, site.ground_material)
-    one_hot = (matter[:, None] == materials).astype(jnp.float32)
-    each = jnp.append(_box_fractions(site.obstacles, a, direction), _ground_fraction(site, a, direction))
-    fractions = jnp.dot(each, one_hot, precision=jax.lax.Precision.HIGHEST)
+    one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
+    # a product, because as a sum it would be the dearest part
+    boxes = _box_fractions(site.obstacles, a, direction)
+    fractions = jnp.dot(boxes, one_hot, precision=jax.lax.Precision.HIGHEST)
+    soil = ground_fraction(site, a, direction) if soil is None else soil
+    fractions = fractions + jnp.where(materials == site.ground_material, soil, 0.0)
     total = jnp.sum(fractions)
     fractions = fractions / jnp.maximum(total, 1.0)
     if "air" in site.material_names:
@@ -68,8 +69,8 @@ def _slab_fraction(middle: list[jax.Array], reach: list[jax.Array], half: list[j
     return jnp.maximum(last - first, 0.0)
 
 
-def _ground_fraction(site: Site, a: jax.Array, direction: jax.Array) -> jax.Array:
-    """Fraction [] of the segment below the terrain."""
+def ground_fraction(site: Site, a: jax.Array, direction: jax.Array) -> jax.Array:
+    """Fraction [] of the segment from ``a`` [3] along ``direction`` [3] (its whole length, m) below the terrain."""
     points = a + jnp.linspace(0.0, 1.0, GROUND_SAMPLES)[:, None] * direction
     depth = sample(site.terrain_m, site, points[:, :2]) - points[:, 2]
     below = jnp.maximum(depth, 0.0)

@@ -17,6 +17,7 @@ from swarmsim.estimation.likelihood import (
 )
 from swarmsim.radiation import Source, net_rate
 from swarmsim.site import path_lengths
+from swarmsim.site.horizon import ceilings
 from tests.estimation.survey import NUCLIDE, detector, draw, mean_rates, orbit, place, survey
 
 _information = jax.jit(fisher_information)
@@ -84,12 +85,14 @@ def test_score_has_zero_mean_and_the_information_as_covariance():
     def score(key):
         problem = FitProblem(
             site=site,
+            above=ceilings(site),
             detectors=d,
             measurements=draw(m, rates, key),
             nuclide=NUCLIDE,
             extra_cps=jnp.zeros(231),
             height_m=jnp.float32(1.0),
             height_std_m=jnp.float32(jnp.inf),
+            rays=1,
         )
         found = evaluate(problem, theta)
         return found.score, found.information

@@ -31,7 +31,7 @@ from tests.estimation.survey import (
 )
 
 SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
-QUICK = settings(iterations=120, search_rounds=2, fisher_steps=4)
+QUICK = settings(iterations=120, search_rounds=2, fisher_steps=4, rays_per_window=1, sample_rounds=4, samples=32)
 MAP = mapping(variance_kept=0.9, cell_m=5.0, length_scale_m=14.0)
 STARTS = jnp.array([[5.0, 8.0], [20.0, -2.0]])
 _compiled = jax.jit(localise)
@@ -46,7 +46,7 @@ def fly(site, detectors, flight, rates, seed, missions=64):
         spots = extract_hotspots(MAP, interpolate(MAP, m))
         return localise(site, detectors, m, initial_points(MAP, spots, 2), NUCLIDE, QUICK)
 
-    return jax.lax.map(mission, jax.random.split(jax.random.key(seed), missions), batch_size=16)
+    return jax.lax.map(mission, jax.random.split(jax.random.key(seed), missions))
 
 
 def cramer_rao_std(site, detectors, flight):
@@ -55,17 +55,17 @@ def cramer_rao_std(site, detectors, flight):
 
 
 def test_aerial_estimate_reaches_the_cramer_rao_bound_and_knows_its_error():
-    """256 seeds of the physical detector, 924 one-second counts each."""
+    """128 seeds of the physical detector over open ground, 924 one-second counts each."""
     site, d, flight = place(), (detector(),), survey()
     rates = mean_rates(site, d, flight, [(SOURCE, ACTIVITY)])
     bound = cramer_rao_std(site, d, flight)
-    parts = [fly(site, d, flight, rates, seed) for seed in range(4)]
+    parts = [fly(site, d, flight, rates, seed) for seed in range(2)]
     fits = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     error = (fits.position_m - np.asarray(SOURCE))[:, :2]
     rmse = np.sqrt(np.mean(error**2, axis=0))
     assert np.all(rmse <= 1.3 * bound[:2])
-    assert np.all(rmse >= 0.85 * bound[:2])  # nobody beats the bound: the errors would be wrong
-    assert np.all(np.abs(error.mean(axis=0)) < 4.0 * bound[:2] / 16.0)
+    assert np.all(rmse >= 0.8 * bound[:2])  # nobody beats the bound: the errors would be wrong
+    assert np.all(np.abs(error.mean(axis=0)) < 4.0 * bound[:2] / np.sqrt(128))
     assert np.mean(fits.converged) > 0.98
     covariance = fits.covariance_m2[:, :2, :2]
     normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
@@ -105,7 +105,9 @@ def test_expected_counts_give_the_truth_back():
     truth = jnp.array([12.0, 4.0, 12.0 * 0.05 - 4.0 * 0.1 + 1.0])
     m = noiseless(site, d, survey(count=300, slope=(0.05, -0.1)), [(truth, ACTIVITY)])
     fit = _localise(site, d, m, STARTS, NUCLIDE, QUICK)
-    np.testing.assert_allclose(fit.position_m, truth, atol=0.03)
+    sigma = np.sqrt(np.diag(fit.covariance_m2))
+    assert np.all(np.abs(np.asarray(fit.position_m - truth)) < 0.25 * sigma)  # sampling, and the skew of the posterior
+    assert np.all(sigma < [2.5, 2.5, 0.6])
     np.testing.assert_allclose(fit.activity_bq, ACTIVITY, rtol=0.01)
     np.testing.assert_allclose(fit.background_scale, 1.0, rtol=0.003)
     assert bool(fit.converged)
@@ -149,7 +151,8 @@ def test_ground_data_sharpen_the_aerial_estimate():
     both = _localise(site, d, m, STARTS, NUCLIDE, QUICK)
     aerial = _localise(site, d, replace(m, valid=m.detector == 0), STARTS, NUCLIDE, QUICK)
     assert float(both.covariance_m2[0, 0]) < 0.05 * float(aerial.covariance_m2[0, 0])
-    np.testing.assert_allclose(both.position_m, SOURCE, atol=0.02)
+    np.testing.assert_allclose(both.position_m[:2], SOURCE[:2], atol=0.02)
+    np.testing.assert_allclose(both.position_m[2], SOURCE[2], atol=0.5 * float(jnp.sqrt(both.covariance_m2[2, 2])))
     np.testing.assert_allclose(both.activity_bq, ACTIVITY, rtol=0.01)
 
 

@@ -80,19 +80,20 @@ def test_uavs_fly_the_lines_at_the_height_above_ground(simulation, records):
 def test_mission_k_of_a_batch_is_the_mission_of_its_seed(simulation, batch, records):
     alone = swarmsim.mission_record(simulation, simulation.rollout(6), 0)
     together = records[1]
-    # Programs of different batch sizes round differently. Flight and aerial counts stay alike to millimetres; the
-    # search for the estimate then ends within its uncertainty, and the route, planned in cells of 1 m, may move by one.
+    # Programs of different batch sizes round differently. Flights stay alike to millimetres, the aerial estimate to a
+    # fifth of its standard deviation; the route, planned in cells, may move by one cell.
     for one, other in zip(alone.vehicles, together.vehicles, strict=True):
         count = min(len(one.time_s), len(other.time_s))
-        tolerance = 0.01 if one.kind == "multirotor" else 1.5
+        tolerance = 0.005 if one.kind == "multirotor" else 1.5
         np.testing.assert_allclose(one.position_m[:count], other.position_m[:count], atol=tolerance)
     counts = [record.samples.of_phase("aerial").counts for record in (alone, together)]
     assert len(counts[0]) == len(counts[1])
     assert np.mean(counts[0] != counts[1]) < 0.005
     spread = np.sqrt(np.diag(alone.aerial_estimate.covariance_m2))
-    assert np.all(np.abs(alone.aerial_estimate.position_m - together.aerial_estimate.position_m) < spread)
-    np.testing.assert_allclose(alone.estimate.position_m[:2], together.estimate.position_m[:2], atol=0.1)
-    assert alone.estimate.activity_mbq == pytest.approx(together.estimate.activity_mbq, rel=0.05)
+    assert np.all(np.abs(alone.aerial_estimate.position_m - together.aerial_estimate.position_m) < 0.2 * spread)
+    spread = np.sqrt(np.diag(alone.estimate.covariance_m2))
+    assert np.all(np.abs(alone.estimate.position_m - together.estimate.position_m) < 0.2 * spread)
+    assert alone.estimate.activity_mbq == pytest.approx(together.estimate.activity_mbq, rel=0.005)
     assert alone.spectrum.nuclide == together.spectrum.nuclide
 
 
