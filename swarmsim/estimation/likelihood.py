@@ -5,6 +5,7 @@ Poisson with mean exposure * observed_rate(activity * r + extra + (scale - 1) * 
 net rate per becquerel through the known site; the background scale multiplies every detector's nominal background.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -52,6 +53,7 @@ def position_of(site: Site, theta: jax.Array) -> jax.Array:
     return jnp.stack([theta[0], theta[1], sample(site.terrain_m, site, theta[:2]) + theta[2]])
 
 
+@partial(jax.jit, static_argnames="rays")  # traced once for the several places of a program that ask for it
 def net_rates(
     site: Site,
     detectors: tuple[Detector, ...],
