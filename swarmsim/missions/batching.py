@@ -32,8 +32,8 @@ def batched(function: Callable[..., Any], axes: Axes, missions: int, out_axes: A
     return jax.vmap(function, in_axes=axes, out_axes=out_axes, axis_size=missions)
 
 
-def one_by_one(function: Callable[..., Any], axes: Axes) -> Callable[..., Any]:
-    """One mission after the other: for what fills the processor alone, its intermediate values staying in the cache."""
+def in_groups(function: Callable[..., Any], axes: Axes, together: int) -> Callable[..., Any]:
+    """Groups of ``together`` missions after one another, each in step: bounds what is held in memory at a time."""
 
     def every(*arguments: Any) -> Any:
         own = [argument for argument, axis in zip(arguments, axes, strict=True) if axis == 0]
@@ -43,9 +43,17 @@ def one_by_one(function: Callable[..., Any], axes: Axes) -> Callable[..., Any]:
             whole = (next(remaining) if axis == 0 else a for a, axis in zip(arguments, axes, strict=True))
             return function(*whole)
 
-        return jax.lax.map(one, own)
+        return jax.lax.map(one, own, batch_size=together if together > 1 else None)
 
     return every
+
+
+def missions_together() -> int:
+    """How many missions to take in step in what fills a processor core alone: one, whose values stay in the cache.
+
+    An accelerator has room for more, and needs them.
+    """
+    return 1 if jax.default_backend() == "cpu" else 256
 
 
 def spread(function: Callable[..., Any], axes: Axes, shards: int) -> Callable[..., Any]:

@@ -7,7 +7,7 @@ import jax
 
 from swarmsim.estimation import Measurements
 from swarmsim.missions import knowledge
-from swarmsim.missions.batching import Axes, batched, one_by_one, shards_of, spread
+from swarmsim.missions.batching import Axes, batched, in_groups, missions_together, shards_of, spread
 from swarmsim.missions.knowledge import AerialKnowledge, GroundKnowledge
 from swarmsim.missions.measure import Log
 from swarmsim.missions.simulation import Dynamics
@@ -27,13 +27,16 @@ def batch_stage(
 ) -> Stage:
     """The compiled form for a number of missions of a function of one: ``axes`` tells which arguments are theirs.
 
-    ``in_step`` missions are vmapped, else they run one after the other. Missions are spread over the devices where each
-    gets as many, unless ``out_axes`` says that some results are common to all.
+    ``in_step`` missions are vmapped, else they run in groups of `missions_together`. Missions are spread over the
+    devices where each gets as many, unless ``out_axes`` says that some results are common to all.
     """
     shards = shards_of(missions) if out_axes == 0 else 1
     if missions % shards:
         shards = 1
-    part = batched(function, axes, missions // shards, out_axes) if in_step else one_by_one(function, axes)
+    if in_step:
+        part = batched(function, axes, missions // shards, out_axes)
+    else:
+        part = in_groups(function, axes, missions_together())
     return Stage(name, spread(part, axes, shards), clock)
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmsim.missions import events, keys
-from swarmsim.missions.batching import batched, one_by_one, shards_of, spread
+from swarmsim.missions.batching import batched, in_groups, shards_of, spread
 from swarmsim.missions.flight import Traffic, follow, keep_apart
 from swarmsim.missions.stage import Clock, Stage
 from swarmsim.policies.path import Path
@@ -92,17 +92,18 @@ def test_consumers_and_seeds_have_their_own_keys():
 
 
 @pytest.mark.parametrize("missions", [1, 2, 5])
-def test_one_by_one_equals_in_step_and_spread(missions):
+def test_in_groups_equals_in_step_and_spread(missions):
     def function(x, shared):
         return jnp.cumsum(x) * shared, jnp.sum(x)
 
     x = jnp.arange(12.0 * missions).reshape(missions, 12)
     in_step = jax.jit(batched(function, (0, None), missions))(x, 3.0)
-    in_turn = jax.jit(one_by_one(function, (0, None)))(x, 3.0)
+    in_turn = jax.jit(in_groups(function, (0, None), 1))(x, 3.0)
+    by_three = jax.jit(in_groups(function, (0, None), 3))(x, 3.0)
     over = jax.jit(spread(batched(function, (0, None), missions), (0, None), 1))(x, 3.0)
-    for a, b, c in zip(in_step, in_turn, over, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6)
-        np.testing.assert_allclose(a, c, rtol=1e-6)
+    for expected, *others in zip(in_step, in_turn, by_three, over, strict=True):
+        for other in others:
+            np.testing.assert_allclose(other, expected, rtol=1e-6)
 
 
 def test_a_batch_spread_over_devices_equals_one_on_one_device():
