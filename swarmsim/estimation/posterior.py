@@ -94,7 +94,7 @@ def sample_posterior(
     weight = _truncated(_log_weights(known, means, roots, jnp.asarray(rounds - 1)))
     mean, covariance = _moments(known.theta, weight)
     own = jnp.einsum("kn,knij->ij", weight, known.nuisance)
-    return Posterior(mean=mean, covariance=covariance.at[3:, 3:].add(own), effective=1.0 / jnp.sum(jnp.square(weight)))
+    return Posterior(mean=mean, covariance=covariance.at[3:, 3:].add(own), effective=_effective(weight))
 
 
 def _log_weights(known: Weighed, means: jax.Array, roots: jax.Array, last: jax.Array) -> jax.Array:
@@ -117,31 +117,38 @@ def _inverse(roots: jax.Array) -> jax.Array:
     return jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
 
 
-def _flattened(log_weights: jax.Array, effective: float) -> jax.Array:
-    """Weights [...] of sum 1 to the greatest power, at most 1, that makes them worth ``effective`` equal ones."""
+def _weights(log_weights: jax.Array, power: jax.Array | float = 1.0) -> jax.Array:
+    """Weights [...] of sum 1 to a power; equal ones where no place has any."""
     top = jnp.max(log_weights)
     relative = jnp.where(jnp.isfinite(top), log_weights - top, 0.0)
+    return jax.nn.softmax(jnp.where(jnp.isfinite(relative), power * relative, -jnp.inf), axis=None)
 
-    def weights(power: jax.Array) -> jax.Array:
-        return jax.nn.softmax(jnp.where(jnp.isfinite(relative), power * relative, -jnp.inf), axis=None)
+
+def _effective(weights: jax.Array) -> jax.Array:
+    """How many equal weights these are worth [] (Kish 1965)."""
+    return 1.0 / jnp.sum(jnp.square(weights))
+
+
+def _flattened(log_weights: jax.Array, effective: float) -> jax.Array:
+    """Weights [...] of sum 1 to the greatest power, at most 1, that makes them worth ``effective`` equal ones."""
 
     def halve(_: int, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = bracket
         middle = 0.5 * (low + high)
-        enough = 1.0 / jnp.sum(jnp.square(weights(jnp.exp(middle)))) >= effective
+        enough = _effective(_weights(log_weights, jnp.exp(middle))) >= effective
         return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
 
     low, _ = jax.lax.fori_loop(0, 12, halve, (jnp.asarray(-12.0), jnp.asarray(0.0)))
-    enough = 1.0 / jnp.sum(jnp.square(weights(jnp.asarray(1.0)))) >= effective
-    return weights(jnp.where(enough, 1.0, jnp.exp(low)))
+    enough = _effective(_weights(log_weights)) >= effective
+    return _weights(log_weights, jnp.where(enough, 1.0, jnp.exp(low)))
 
 
 def _truncated(log_weights: jax.Array) -> jax.Array:
-    """Weights [...] of sum 1, none above its mean times the root of their number (Ionides, JCGS 17, 2008, 295).
+    """Weights [...] of sum 1, cut off at their mean times the root of their number (Ionides, JCGS 17, 2008, 295).
 
     A place that the distributions drawn from hardly ever reach would otherwise outweigh all others.
     """
-    weights = _flattened(log_weights, 1.0)
+    weights = _weights(log_weights)
     weights = jnp.minimum(weights, 1.0 / jnp.sqrt(weights.size))
     return weights / jnp.sum(weights)
 
