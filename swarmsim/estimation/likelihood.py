@@ -66,7 +66,7 @@ def net_rates(
     """Net rate [n] in counts/s per becquerel of a source at ``position_m`` [3] in each measurement's detector.
 
     The mean over the way of the crystal during the measurement, by a ray to the middle of each of ``rays`` equal parts
-    of it: between them, 1/r² is integrated in closed form and the rest taken as constant. ``above`` is the site's
+    of it: within each, 1/r² is integrated in closed form and the rest taken as constant. ``above`` is the site's
     pyramid of `ceilings`, where the caller has it already.
     """
     above = ceilings(site) if above is None else above

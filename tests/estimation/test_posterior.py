@@ -83,7 +83,7 @@ def test_activity_spread_includes_its_own_at_each_place():
     np.testing.assert_allclose(np.sqrt(found.covariance[3, 3]), expected, rtol=0.15)
 
 
-def test_without_any_sample_the_site_is_all_that_is_known():
+def test_without_any_measurement_the_moments_are_finite():
     problem = problem_of([], 0)
     m = problem.measurements
     nothing = replace(problem, measurements=replace(m, valid=jnp.zeros_like(m.valid)))

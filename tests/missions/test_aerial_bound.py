@@ -11,7 +11,7 @@ from swarmsim.estimation import cramer_rao_covariance, fisher_information
 from swarmsim.missions import keys, knowledge
 
 SEEDS = 256
-# Fewer starts, rays and places than a mission takes: the bound is asked for within 30 %, and there are 256 fits.
+# Fewer rounds, rays and places than a mission takes: the bound is asked for within 30 %, and there are 256 fits.
 QUICK = (
     "localisation.iterations=120",
     "localisation.search_rounds=0",
