@@ -7,8 +7,13 @@ Load a scenario, build it, roll it out:
     batch = simulation.rollout(range(16))
     print(swarmsim.mission_record(simulation, batch, 0).finding)
 
-or step its team by hand with :class:`swarmsim.Stepper`. The names below are loaded when they are first used, so that
-importing swarmsim is quick.
+or step its world by hand:
+
+    world, state = simulation.world, simulation.reset(seed=0)
+    state, readings = swarmsim.step(world, state, swarmsim.hold(world, state))
+
+`step` is pure: `jax.jit`, `jax.vmap`, `jax.lax.scan` and `jax.grad` work on it. The names below are loaded when they
+are first used, so that importing swarmsim is quick.
 """
 
 import importlib
@@ -21,50 +26,101 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 if TYPE_CHECKING:
     from swarmsim.config.errors import InputError
+    from swarmsim.config.policies import PolicySettings
     from swarmsim.config.scenario import load_scenario as load
-    from swarmsim.missions.extract import mission_record
-    from swarmsim.missions.record import MissionRecord
-    from swarmsim.missions.rollout import MissionBatch, Simulation
-    from swarmsim.missions.run import build, run
-    from swarmsim.missions.stepping import Command, Observation, Stepper, TeamState
-    from swarmsim.policies import register as register_policy
+    from swarmsim.control.commands import (
+        AttitudeCommand,
+        BodyRateCommand,
+        DriveCommand,
+        DriveToCommand,
+        PositionCommand,
+        RotorSpeedCommand,
+        WheelSpeedCommand,
+        fly_velocity,
+        go_to,
+    )
+    from swarmsim.policies.registry import register as register_policy
+    from swarmsim.policies.view import Task, View
+    from swarmsim.results.extract import mission_record
+    from swarmsim.results.hand_stepped import Frame, observe, record_steps
+    from swarmsim.results.record import MissionRecord
+    from swarmsim.results.run_directory import write_run
+    from swarmsim.runtime.devices import use_all_cores
+    from swarmsim.runtime.run import build, run
+    from swarmsim.runtime.simulation import MissionBatch, Simulation
+    from swarmsim.world.model import World
+    from swarmsim.world.state import WorldState
+    from swarmsim.world.step import hold, reset, step
 
 _HOMES = {
-    "Command": ("swarmsim.missions.stepping", "Command"),
-    "InputError": ("swarmsim.config.errors", "InputError"),
-    "MissionBatch": ("swarmsim.missions.rollout", "MissionBatch"),
-    "MissionRecord": ("swarmsim.missions.record", "MissionRecord"),
-    "Observation": ("swarmsim.missions.stepping", "Observation"),
-    "Simulation": ("swarmsim.missions.rollout", "Simulation"),
-    "Stepper": ("swarmsim.missions.stepping", "Stepper"),
-    "TeamState": ("swarmsim.missions.stepping", "TeamState"),
-    "build": ("swarmsim.missions.run", "build"),
-    "load": ("swarmsim.config.scenario", "load_scenario"),
-    "mission_record": ("swarmsim.missions.extract", "mission_record"),
-    "register_policy": ("swarmsim.policies", "register"),
-    "run": ("swarmsim.missions.run", "run"),
+    "config.errors": ("InputError",),
+    "config.policies": ("PolicySettings",),
+    "config.scenario": ("load_scenario",),
+    "control.commands": (
+        "AttitudeCommand",
+        "BodyRateCommand",
+        "DriveCommand",
+        "DriveToCommand",
+        "PositionCommand",
+        "RotorSpeedCommand",
+        "WheelSpeedCommand",
+        "fly_velocity",
+        "go_to",
+    ),
+    "policies.registry": ("register",),
+    "policies.view": ("Task", "View"),
+    "results.extract": ("mission_record",),
+    "results.hand_stepped": ("Frame", "observe", "record_steps"),
+    "results.record": ("MissionRecord",),
+    "results.run_directory": ("write_run",),
+    "runtime.devices": ("use_all_cores",),
+    "runtime.run": ("build", "run"),
+    "runtime.simulation": ("MissionBatch", "Simulation"),
+    "world.model": ("World",),
+    "world.state": ("WorldState",),
+    "world.step": ("hold", "reset", "step"),
 }
+_SHORTER = {"load_scenario": "load", "register": "register_policy"}
+_PLACES = {_SHORTER.get(name, name): (f"swarmsim.{home}", name) for home, names in _HOMES.items() for name in names}
 
 __all__ = [
-    "Command",
+    "AttitudeCommand",
+    "BodyRateCommand",
+    "DriveCommand",
+    "DriveToCommand",
+    "Frame",
     "InputError",
     "MissionBatch",
     "MissionRecord",
-    "Observation",
+    "PolicySettings",
+    "PositionCommand",
+    "RotorSpeedCommand",
     "Simulation",
-    "Stepper",
-    "TeamState",
+    "Task",
+    "View",
+    "WheelSpeedCommand",
+    "World",
+    "WorldState",
     "build",
+    "fly_velocity",
+    "go_to",
+    "hold",
     "load",
     "mission_record",
+    "observe",
+    "record_steps",
     "register_policy",
+    "reset",
     "run",
+    "step",
+    "use_all_cores",
+    "write_run",
 ]
 
 
 def __getattr__(name: str) -> Any:
     """Load a public name from its home when it is first asked for."""
-    if name not in _HOMES:
+    if name not in _PLACES:
         raise AttributeError(f"module 'swarmsim' has no attribute {name!r}")
-    module, attribute = _HOMES[name]
+    module, attribute = _PLACES[name]
     return getattr(importlib.import_module(module), attribute)

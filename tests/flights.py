@@ -61,7 +61,7 @@ def hover_speed(params: MultirotorParams) -> float:
 
 @partial(jax.jit, static_argnames=("name", "engine"))
 def _fly(params, state, commands, wind, ground, name, engine):
-    step = make_multirotor_step(spec_of(name), engine, DT)
+    step = make_multirotor_step(engine, DT)
 
     def body(state, command):
         state = step(params, state, command, wind, ground)
@@ -84,7 +84,7 @@ def fly(params, state, commands, *, steps=None, wind=CALM, ground=None, name="ta
 
 @partial(jax.jit, static_argnames=("setpoint_at", "name", "engine", "ticks", "gusts"))
 def _controlled(params, state, ground, wind_m_s, seed, setpoint_at, name, engine, ticks, gusts):
-    step = make_multirotor_step(spec_of(name), engine, DT)
+    step = make_multirotor_step(engine, DT)
 
     def tick(carry, k):
         state, memory, gust = carry

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.site import SiteSpec
-from swarmsim.missions.record import (
+from swarmsim.results.record import (
     Estimate,
     Event,
     MissionRecord,
@@ -85,45 +85,8 @@ def _mesh(step_m: float) -> VisualMesh:
     triangles = [(corner + np.array([[0, 1, columns + 1, 0, columns + 1, columns]])).reshape(-1, 3)]
     speckle = np.random.default_rng(0).integers(-8, 8, (rows * columns, 1))
     colours = [np.c_[np.array([118, 128, 96]) + speckle, np.full(rows * columns, 255)]]
-    around = [
-        0,
-        2,
-        1,
-        0,
-        3,
-        2,
-        4,
-        5,
-        6,
-        4,
-        6,
-        7,
-        0,
-        1,
-        5,
-        0,
-        5,
-        4,
-        1,
-        2,
-        6,
-        1,
-        6,
-        5,
-        2,
-        3,
-        7,
-        2,
-        7,
-        6,
-        3,
-        0,
-        4,
-        3,
-        4,
-        7,
-    ]
-    faces = np.reshape(around, (-1, 3))
+    around = "021 032 456 467 015 054 126 165 237 276 304 347"
+    faces = np.array([[int(corner) for corner in face] for face in around.split()])
     signs = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
     for cx, cy, length, width, height in BUILDINGS:
         base = ground(np.array(cx), np.array(cy))
@@ -211,18 +174,17 @@ def _vehicle(
 
 
 def _samples(
-    vehicles: tuple[VehicleRecord, ...], aerial_end_s: float, rate_hz: float, activity: float, rng: np.random.Generator
+    vehicles: tuple[VehicleRecord, ...], survey_end_s: float, rate_hz: float, activity: float, rng: np.random.Generator
 ) -> Samples:
     parts = []
     for index, vehicle in enumerate(vehicles):
-        aerial = vehicle.kind == "multirotor"
-        period = 1.0 / rate_hz if aerial else 1.0
-        start, end = (0.0, aerial_end_s) if aerial else (aerial_end_s, vehicle.time_s[-1])
+        period = 1.0 / rate_hz if vehicle.flies else 1.0
+        start, end = (0.0, survey_end_s) if vehicle.flies else (survey_end_s, vehicle.time_s[-1])
         time = start + period * np.arange(1, int((end - start) / period) + 1)
         position = np.stack([np.interp(time, vehicle.time_s, vehicle.position_m[:, k]) for k in range(3)], -1)
-        counts = rng.poisson(rate_cps(position, activity, 1.0 if aerial else 1.78)).astype(float)
+        counts = rng.poisson(rate_cps(position, activity, 1.0 if vehicle.flies else 1.78)).astype(float)
         exposure = np.ones_like(time)
-        phase = np.full(len(time), "aerial" if aerial else "ground")
+        phase = np.full(len(time), "survey" if vehicle.flies else "search")
         parts.append((np.full(len(time), index, np.int32), phase, time, position, counts, exposure, counts / exposure))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     order = np.argsort(columns[2], kind="stable")
@@ -250,7 +212,7 @@ def _spectrum(rng: np.random.Generator) -> Spectrum:
     )
 
 
-def _map(samples: Samples, cell_m: float, found: bool) -> RadiationMap:
+def _map(cell_m: float, found: bool) -> RadiationMap:
     x, y = np.arange(-65.0, 65.1, cell_m), np.arange(-50.0, 50.1, cell_m)
     grid = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), 20.0)], -1)
     mean = rate_cps(grid.reshape(-1, 3), ACTIVITY_MBQ if found else 0.0).reshape(len(y), len(x))
@@ -264,16 +226,17 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
     """A whole mission of about nine minutes; with ``found`` False there is no source, and nothing was found."""
     rng = np.random.default_rng(seed)
     paths = [_survey_path(k) for k in range(3)]
-    aerial_end = max(np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in paths) / 2.4 + 2.0
+    survey_end = max(np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in paths) / 2.4 + 2.0
     route = _route()
     drive = np.linalg.norm(np.diff(route, axis=0), axis=1).sum() / 0.9 + 5.0 if found else 0.0
-    time = np.arange(0.0, aerial_end + drive, 1.0 / log_hz)
+    time = np.arange(0.0, survey_end + drive, 1.0 / log_hz)
     vehicles = (
         *(_vehicle(f"uav{k + 1}", "multirotor", path, 2.4, 1.0, time) for k, path in enumerate(paths)),
-        _vehicle("orpheus", "skid_steer", route, 0.9 if found else 0.0, aerial_end + 1.0, time),
+        _vehicle("orpheus", "skid_steer", route, 0.9 if found else 0.0, survey_end + 1.0, time),
     )
-    samples = _samples(vehicles, aerial_end, sample_hz, ACTIVITY_MBQ if found else 0.0, rng)
-    phases = (Phase("aerial survey", 0.0, aerial_end),)
+    phases = (Phase("survey", "parallel_lines", (0, 1, 2), 0.0, survey_end, True),)
+    if found:
+        phases += (Phase("search", "approach_and_orbit", (3,), survey_end, survey_end + drive, True),)
     estimate = Estimate(
         position_m=SOURCE_M + np.array([0.12, -0.09, 0.2]),
         covariance_m2=np.array([[0.020, 0.006, 0.0], [0.006, 0.012, 0.0], [0.0, 0.0, 0.09]]),
@@ -282,27 +245,61 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
         background_scale=1.01,
         nuclide="Co-60",
     )
-    aerial = dataclasses.replace(
+    survey = dataclasses.replace(
         estimate,
         position_m=SOURCE_M + np.array([0.9, -0.6, -0.5]),
         covariance_m2=np.array([[1.9, 0.4, 0.0], [0.4, 1.6, 0.0], [0.0, 0.0, 0.25]]),
         activity_mbq=161.0,
         activity_std_mbq=9.0,
     )
-    events = tuple(Event(aerial_end - 2.0 + 0.3 * k, v.name, "landed", "0.4 m/s") for k, v in enumerate(vehicles[:3]))
+    done = "had done its part of phase survey"
     return MissionRecord(
         name="synthetic",
         site="synthetic",
         seed=seed,
-        phases=(*phases, Phase("ground search", aerial_end, aerial_end + drive)) if found else phases,
+        phases=phases,
         vehicles=vehicles,
-        samples=samples,
-        map=_map(samples, 2.0, found),
-        aerial_estimate=aerial if found else None,
+        samples=_samples(vehicles, survey_end, sample_hz, ACTIVITY_MBQ if found else 0.0, rng),
+        sought="nuclide",
+        map=_map(2.0, found),
+        survey_estimate=survey if found else None,
+        surveyed_s=survey_end,
         estimate=estimate if found else None,
         spectrum=_spectrum(rng) if found else None,
         sources=(TrueSource("Co-60", SOURCE_M, ACTIVITY_MBQ),) if found else (),
-        route_m=route if found else np.zeros((0, 3)),
-        events=events,
+        paths_m={3: route} if found else {},
+        events=tuple(Event(survey_end - 2.0 + 0.3 * k, f"uav{k + 1}", "finished", done) for k in range(3)),
         finding="Co-60 source found." if found else "No source above background.",
+    )
+
+
+def swarm(count: int = 200, duration_s: float = 300.0, log_hz: float = 10.0) -> MissionRecord:
+    """``count`` quadrotors without detectors, in circles of 3 to 60 m radius; nothing is sought."""
+    time = np.arange(0.0, duration_s + 1e-9, 1.0 / log_hz)
+    radius = np.linspace(3.0, 60.0, count)
+    vehicles = []
+    for k in range(count):
+        angle = 2.0 * np.pi * k / count + 5.0 / radius[k] * time
+        x, y = radius[k] * np.cos(angle), 0.8 * radius[k] * np.sin(angle)
+        points = np.stack([x, y, 15.0 + 0.02 * x], -1)
+        one = _vehicle(f"uav{k + 1}", "multirotor", points[:2], 1.0, 0.0, time)
+        vehicles.append(dataclasses.replace(one, type="x500", position_m=points))
+    nothing = np.zeros(0)
+    return MissionRecord(
+        name="swarm",
+        site="synthetic",
+        seed=0,
+        phases=(Phase("cover", "parallel_lines", tuple(range(count)), 0.0, duration_s, True),),
+        vehicles=tuple(vehicles),
+        samples=Samples(np.zeros(0, np.int32), np.zeros(0, str), nothing, np.zeros((0, 3)), nothing, nothing, nothing),
+        sought="nothing",
+        map=None,
+        survey_estimate=None,
+        surveyed_s=duration_s,
+        estimate=None,
+        spectrum=None,
+        sources=(),
+        paths_m={},
+        events=(),
+        finding="nothing was sought",
     )

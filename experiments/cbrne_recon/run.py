@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from swarmsim.missions.progress import RichProgress
-from swarmsim.missions.summary import batch_row
 from swarmsim.radiation import net_rate
+from swarmsim.results.summary import batch_row
+from swarmsim.runtime.progress import RichProgress
 from swarmsim.site import path_lengths
 
 HEIGHT_M = 20.0  # height above the source at which the net rate is stated
@@ -34,16 +34,16 @@ class Figure:
 
 # Published: the Gazebo reconnaissance mission; the bounds are this project's acceptance bars.
 PAPER = (
-    Figure("aerial count rate, least [cps]", "aerial_count_rate_min_cps", "67", 61.0, 73.0),
-    Figure("aerial count rate, greatest [cps]", "aerial_count_rate_max_cps", "245", 233.0, 257.0),
-    Figure("aerial measurements", "aerial_measurements", "> 10,000", 10_000.0, np.inf),
-    Figure("aerial path, total [m]", "aerial_path_length_m", "2,100", 1890.0, 2310.0),
-    Figure("aerial duration [s]", "aerial_duration_s", "308", 261.8, 354.2),
-    Figure("ground path [m]", "ground_path_length_m", "180", 135.0, 225.0),
-    Figure("ground measurements", "ground_measurements", "about 200", 150.0, 250.0),
-    Figure("ground duration [s]", "ground_duration_s", "210", 157.5, 262.5),
-    Figure("ground count rate, least [cps]", "ground_count_rate_min_cps", "169", -np.inf, np.inf),
-    Figure("ground count rate, greatest [cps]", "ground_count_rate_max_cps", "3,688", -np.inf, np.inf),
+    Figure("aerial count rate, least [cps]", "survey_count_rate_min_cps", "67", 61.0, 73.0),
+    Figure("aerial count rate, greatest [cps]", "survey_count_rate_max_cps", "245", 233.0, 257.0),
+    Figure("aerial measurements", "survey_measurements", "> 10,000", 10_000.0, np.inf),
+    Figure("aerial path, total [m]", "survey_path_length_m", "2,100", 1890.0, 2310.0),
+    Figure("aerial duration [s]", "survey_duration_s", "308", 261.8, 354.2),
+    Figure("ground path [m]", "search_path_length_m", "180", 135.0, 225.0),
+    Figure("ground measurements", "search_measurements", "about 200", 150.0, 250.0),
+    Figure("ground duration [s]", "search_duration_s", "210", 157.5, 262.5),
+    Figure("ground count rate, least [cps]", "search_count_rate_min_cps", "169", -np.inf, np.inf),
+    Figure("ground count rate, greatest [cps]", "search_count_rate_max_cps", "3,688", -np.inf, np.inf),
     Figure("real-time factor", "real_time_factor", "0.88", 0.88, np.inf),
 )
 OWN = (
@@ -59,7 +59,7 @@ def fly(name: str, seeds: int, overrides: list[str]) -> list[dict[str, object]]:
     simulation = swarmsim.build(scenario)
     first = scenario.mission.seed
     with RichProgress(missions=seeds) as progress:
-        batch = simulation.rollout(range(first, first + seeds), progress)
+        batch = simulation.rollout(range(first, first + seeds), progress=progress)
     factor = batch.simulated_s / batch.clock.run_s
     rate = net_rate_above_source(simulation)
     rows = []
@@ -72,10 +72,12 @@ def fly(name: str, seeds: int, overrides: list[str]) -> list[dict[str, object]]:
 def net_rate_above_source(simulation: swarmsim.Simulation) -> float:
     """Net uncollided rate [cps] of a survey UAV hovering level, 20 m above the first source."""
     world = simulation.world
-    detector, source = (jax.tree.map(lambda leaf: leaf[0], tree) for tree in (world.team.detector, world.sources))
+    counter = world.groups[0].counter
+    assert counter is not None  # the survey UAVs carry detectors
+    source = jax.tree.map(lambda leaf: leaf[0], world.sources)
     place = source.position_m + jnp.array([0.0, 0.0, HEIGHT_M])
     lengths = path_lengths(world.site, source.position_m, place)
-    return float(net_rate(detector, source, lengths, place, detector.mount_axis, uncollided=True))
+    return float(net_rate(counter.detector, source, lengths, place, counter.mount_axis[0], uncollided=True))
 
 
 def compare(rows: list[dict[str, object]], figures: tuple[Figure, ...]) -> list[list[str]]:
@@ -102,6 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.seeds < 1:
         parser.error("--seeds must be at least 1")
+    swarmsim.use_all_cores()
     header = ["figure", "published", "median", "5 % to 95 %", "bar met"]
     lines, flat = [], []
     for name, figures in (("recon_paper", PAPER), ("recon", OWN)):

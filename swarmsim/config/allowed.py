@@ -38,6 +38,12 @@ class Shape:
         schema = self.at(place, data)
         return None if schema is None else self._words(schema)
 
+    def choices(self, place: Place, data: Any) -> list[str]:
+        """Words to choose from at ``place``; empty where there are none."""
+        schema = self.at(place, data) or {}
+        options = [self._resolve(option, None) for option in schema.get("anyOf", [schema])]
+        return [str(word) for option in options for word in (*option.get("enum", ()), option.get("const")) if word]
+
     def _step(self, schema: Schema, step: str | int) -> Schema | None:
         if isinstance(step, int):
             prefix = schema.get("prefixItems")

@@ -1,26 +1,31 @@
 """What no single field can tell: names that must exist, and parts of a scenario that must fit together."""
 
+from __future__ import annotations
+
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from swarmsim.config import files
 from swarmsim.config.allowed import item
 from swarmsim.config.documents import Document, Place
 from swarmsim.config.errors import Problem
-from swarmsim.config.mission import Mission
+from swarmsim.config.mission import TEAM_MAX, Mission
 from swarmsim.config.names import did_you_mean, one_of
-from swarmsim.config.radiation import Detector, Material
+from swarmsim.config.phases import check_phases
 from swarmsim.config.site import SiteSpec
+from swarmsim.config.team import RESERVED, team_size
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 
-Vehicles = Sequence[Multirotor | SkidSteer]
+if TYPE_CHECKING:
+    from swarmsim.config.scenario import Scenario
 
 
 def check_references(document: Document, near: Path | None) -> list[Problem]:
-    """Names in a mission's document that name nothing: site, vehicle types, nuclides, policies.
+    """Names in a mission's document that name nothing: site, vehicle types, nuclides.
 
     Works on the plain data, so that wrong names are told together with wrong values; values of a wrong type are left to
     the validation.
@@ -43,9 +48,6 @@ def check_references(document: Document, near: Path | None) -> list[Problem]:
     for i in _indices(item(data, "sources")):
         check("nuclide", ("sources", i, "nuclide"), nuclides)
     check("nuclide", ("localisation", "presumed_nuclide"), nuclides)
-    for kind in ("aerial", "ground"):
-        if isinstance(item(item(data, kind), "policy"), str):
-            check(f"{kind} policy", (kind, "policy"), policy_names(kind))
     return problems
 
 
@@ -59,46 +61,42 @@ def known_names(data: Any, kind: str, near: Path | None) -> list[str]:
     return sorted(names)
 
 
-def policy_names(kind: str) -> list[str]:
-    """Names of the registered policies of a kind, ``aerial`` or ``ground``."""
-    from swarmsim import policies  # costs the import of jax
+def check_team_size(mission: Mission, document: Document) -> list[Problem]:
+    """A team that is too large once its formations are expanded."""
+    size = team_size(mission)
+    if size <= TEAM_MAX:
+        return []
+    allowed = f"at most {TEAM_MAX} vehicles, those of formations included"
+    return [document.problem(("vehicles",), "has too many vehicles", given=str(size), allowed=allowed)]
 
-    return policies.names(kind)
 
-
-def check_detectors(mission: Mission, vehicles: Vehicles, document: Document, near: Path | None) -> list[Problem]:
-    """Vehicles without a detector, or with one that does not exist."""
+def check_detectors(
+    mission: Mission, vehicles: Sequence[Multirotor | SkidSteer], document: Document, near: Path | None
+) -> list[Problem]:
+    """Vehicle types (``vehicles``: of each entry of ``mission.vehicles``) with a detector that does not exist."""
     known = known_names(document.data, "detectors", near)
-    problems = []
+    problems, told = [], set()
     for i, (member, vehicle) in enumerate(zip(mission.vehicles, vehicles, strict=True)):
-        place: Place = ("vehicles", i, "type")
-        if vehicle.detector is None:
-            message = f"the vehicle type '{member.type}' carries no detector, and every vehicle must measure"
-            hint = "give its file a 'detector', or choose another type"
-            problems.append(document.problem(place, message, given=member.type, suggestion=hint))
-        elif (name := vehicle.detector.model) not in known:
-            message = f"the vehicle type '{member.type}' carries a detector '{name}' that does not exist"
-            problems.append(
-                document.problem(place, message, allowed=one_of(known), suggestion=did_you_mean(name, known))
-            )
+        if vehicle.detector is None or vehicle.detector.model in known or member.type in told:
+            continue
+        told.add(member.type)
+        name = vehicle.detector.model
+        message = f"the vehicle type '{member.type}' carries a detector '{name}' that does not exist"
+        hint = did_you_mean(name, known)
+        problems.append(document.problem(("vehicles", i, "type"), message, allowed=one_of(known), suggestion=hint))
     return problems
 
 
-def check_consistency(
-    mission: Mission,
-    vehicles: Vehicles,
-    detectors: Mapping[str, Detector],
-    materials: Mapping[str, Material],
-    site: SiteSpec,
-    document: Document,
-) -> list[Problem]:
+def check_consistency(scenario: Scenario) -> list[Problem]:
     """Everything that the parts of a scenario get wrong together, in the order of the mission's file."""
     return [
-        *_check_definitions(mission, document),
-        *_check_materials(detectors, materials, site, document),
-        *_check_team(mission, vehicles, document),
-        *_check_starts(mission, vehicles, document),
-        *_check_speeds(mission, vehicles, document),
+        *_check_definitions(scenario),
+        *_check_timing(scenario),
+        *_check_materials(scenario),
+        *_check_names(scenario),
+        *_check_pads(scenario),
+        *_check_estimates(scenario),
+        *check_phases(scenario),
     ]
 
 
@@ -118,84 +116,114 @@ def _indices(value: Any) -> range:
     return range(len(value)) if isinstance(value, list) else range(0)
 
 
-def _check_definitions(mission: Mission, document: Document) -> Iterator[Problem]:
+def _check_definitions(scenario: Scenario) -> Iterator[Problem]:
     for kind in ("vehicles", "detectors", "nuclides", "materials"):
-        for key, model in getattr(mission.definitions, kind).items():
+        for key, model in getattr(scenario.mission.definitions, kind).items():
             if model.name != key:
                 place: Place = ("definitions", kind, key, "name")
-                yield document.problem(
+                yield scenario.problem(
                     place, "the name inside differs from the key above it", given=model.name, allowed=key
                 )
 
 
-def _check_materials(
-    detectors: Mapping[str, Detector], materials: Mapping[str, Material], site: SiteSpec, document: Document
-) -> Iterator[Problem]:
+def _check_timing(scenario: Scenario) -> Iterator[Problem]:
+    timing = scenario.mission.timing
+    whole = f"is not a whole number of control periods of {timing.control_period_s:g} s"
+    for field in ("judge_period_s", "log_period_s", "decision_period_s"):
+        period = getattr(timing, field)
+        if nearest := _nearest_multiples(period, timing.control_period_s):
+            yield scenario.problem(("timing", field), whole, given=f"{period:g}", allowed=nearest)
+    for name, detector in scenario.detectors.items():
+        if nearest := _nearest_multiples(detector.sample_period_s, timing.control_period_s):
+            own = name in scenario.mission.definitions.detectors
+            place: Place = ("definitions", "detectors", name) if own else ("timing",)
+            yield scenario.problem(
+                (*place, "sample_period_s" if own else "control_period_s"),
+                f"the sample_period_s of the detector '{name}' {whole}",
+                given=f"{detector.sample_period_s:g}",
+                allowed=nearest,
+                suggestion=f"change timing.control_period_s, or set definitions.detectors.{name}.sample_period_s",
+            )
+
+
+def _nearest_multiples(period: float, unit: float) -> str | None:
+    """The whole multiples of ``unit`` next to ``period`` in words, or None when it is one."""
+    ratio = period / unit
+    if round(ratio) >= 1 and abs(ratio - round(ratio)) <= 1e-6 * ratio:
+        return None
+    low = math.floor(ratio)
+    near = [f"{count * unit:.6g}" for count in (low, low + 1) if count >= 1]
+    return " or ".join(near)
+
+
+def _check_materials(scenario: Scenario) -> Iterator[Problem]:
+    site, materials = scenario.site, scenario.materials
     wanted = [("site", f"the site '{site.name}' is made of", name) for name in _site_materials(site)]
-    for detector in detectors.values():
+    for detector in scenario.detectors.values():
         for name in (detector.crystal, detector.housing.material):
             wanted.append(("vehicles", f"the detector '{detector.name}' is made of", name))
     for where, who, name in wanted:
         if name not in materials:
             message, hint = f"{who} a material '{name}' that does not exist", did_you_mean(name, materials)
-            yield document.problem((where,), message, allowed=one_of(materials), suggestion=hint)
+            yield scenario.problem((where,), message, allowed=one_of(materials), suggestion=hint)
 
 
 def _site_materials(site: SiteSpec) -> list[str]:
     return sorted({site.ground_material, site.default_material, *(obstacle.material for obstacle in site.obstacles)})
 
 
-def _check_team(mission: Mission, vehicles: Vehicles, document: Document) -> Iterator[Problem]:
+def _check_names(scenario: Scenario) -> Iterator[Problem]:
     first: dict[str, int] = {}
-    for i, member in enumerate(mission.vehicles):
-        if member.name in first:
-            message = f"vehicles.{first[member.name]} has the same name: names must differ"
-            yield document.problem(("vehicles", i, "name"), message, given=member.name)
-        first.setdefault(member.name, i)
-    if not any(isinstance(vehicle, Multirotor) for vehicle in vehicles):
-        types = ", ".join(member.type for member in mission.vehicles)
-        message = "the team has no multirotor, and the survey needs at least one"
-        yield document.problem(("vehicles",), message, given=types, suggestion="add a vehicle of a multirotor type")
-    rovers = [i for i, vehicle in enumerate(vehicles) if isinstance(vehicle, SkidSteer)]
-    for i in rovers[1:]:
-        message = f"the team has more than one rover: '{mission.vehicles[rovers[0]].name}' is one already"
-        yield document.problem(("vehicles", i), message, given=mission.vehicles[i].name, allowed="at most one rover")
-
-
-def _check_starts(mission: Mission, vehicles: Vehicles, document: Document) -> Iterator[Problem]:
-    for i, j in combinations(range(len(vehicles)), 2):
-        one, other = mission.vehicles[i], mission.vehicles[j]
-        apart = math.dist(one.position_m, other.position_m)
-        needed = footprint_radius_m(vehicles[i]) + footprint_radius_m(vehicles[j])
-        if apart < needed:
-            yield document.problem(
-                ("vehicles", j, "position_m"),
-                f"'{other.name}' starts on top of '{one.name}': their centres are {apart:.2f} m apart",
-                given=str(list(other.position_m)),
-                allowed=f"at least {needed:.2f} m from {list(one.position_m)}",
-            )
-
-
-def _check_speeds(mission: Mission, vehicles: Vehicles, document: Document) -> Iterator[Problem]:
-    aerial, ground = mission.aerial, mission.ground
+    for i, entry in enumerate(scenario.mission.vehicles):
+        if entry.name in RESERVED:
+            message = "is a word of its own under 'who' of a phase: choose another name"
+            yield scenario.problem(("vehicles", i, "name"), message, given=entry.name)
+    named = [(entry.name, i) for i, entry in enumerate(scenario.mission.vehicles) if entry.formation is not None]
+    named += [(member.name, i) for member, i in zip(scenario.members, scenario.entries, strict=True)]
     told = set()
-    for member, vehicle in zip(mission.vehicles, vehicles, strict=True):
-        limits: list[tuple[Place, float, float, str]]
-        if isinstance(vehicle, Multirotor):
-            climb = vehicle.control.climb_rate_max_m_s
-            limits = [
-                (("aerial", "speed_m_s"), aerial.speed_m_s, vehicle.control.speed_max_m_s, "can fly"),
-                (("aerial", "climb_speed_m_s"), aerial.climb_speed_m_s, climb, "can climb"),
-                (("aerial", "descent_speed_m_s"), aerial.descent_speed_m_s, climb, "can descend"),
-                (("aerial", "touchdown_speed_m_s"), aerial.touchdown_speed_m_s, vehicle.impact_speed_max_m_s, "lands"),
-            ]
-        else:
-            fastest = min(vehicle.control.speed_max_m_s, vehicle.motor.speed_max_rad_s * vehicle.wheels.radius_m)
-            limits = [(("ground", "speed_m_s"), ground.speed_m_s, fastest, "can drive")]
-        for place, value, limit, verb in limits:
-            if value > limit and (place, member.type) not in told:
-                told.add((place, member.type))
-                message = f"is faster than the vehicle type '{member.type}' {verb}"
-                if verb == "lands":
-                    message = f"is a crash for the vehicle type '{member.type}'"
-                yield document.problem(place, message, given=f"{value:g}", allowed=f"at most {limit:g}")
+    for name, i in sorted(named, key=lambda pair: pair[1]):
+        if name in first and (first[name], i) not in told:
+            told.add((first[name], i))
+            message = f"vehicles.{first[name]} has the same name: names must differ"
+            yield scenario.problem(("vehicles", i, "name"), message, given=name)
+        first.setdefault(name, i)
+
+
+def _check_pads(scenario: Scenario) -> Iterator[Problem]:
+    """Vehicles that start too near to each other; a pair of entries of ``vehicles`` is told once."""
+    if len(scenario.members) < 2:
+        return
+    from scipy.spatial import KDTree
+
+    gap = scenario.mission.traffic.pad_gap_m
+    xy = np.array([member.position_m for member in scenario.members])
+    radius = np.array([footprint_radius_m(vehicle) for vehicle in scenario.vehicles])
+    pairs = KDTree(xy).query_pairs(2 * radius.max() + gap, output_type="ndarray")
+    apart = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1)
+    needed = radius[pairs].sum(axis=1) + gap
+    near = np.flatnonzero(apart < needed - 1e-9)
+    near = near[np.lexsort((pairs[near, 0], pairs[near, 1]))]
+    entries = np.array(scenario.entries)[pairs[near]]
+    _, first = np.unique(entries, axis=0, return_index=True)
+    for k in near[np.sort(first)]:
+        one, other = (scenario.members[int(index)] for index in pairs[k])
+        yield scenario.problem(
+            ("vehicles", scenario.entries[int(pairs[k, 1])], "position_m"),
+            f"'{other.name}' starts too near to '{one.name}': their centres are {apart[k]:.2f} m apart",
+            given=str(list(other.position_m)),
+            allowed=f"at least {needed[k]:.2f} m from {list(one.position_m)} (both radii and traffic.pad_gap_m)",
+        )
+
+
+def _check_estimates(scenario: Scenario) -> Iterator[Problem]:
+    """Sections that stand on one another: the map, the estimate from its hotspots, the nuclide at the estimate."""
+    mission = scenario.mission
+    if mission.mapping is not None and all(vehicle.detector is None for vehicle in scenario.vehicles):
+        message = "there is nothing to map: no vehicle of the team carries a detector"
+        yield scenario.problem(("mapping",), message, suggestion="leave it out, or give a vehicle type a detector")
+    if mission.localisation is not None and mission.mapping is None:
+        message = "the estimate starts from the hotspots of the map, and the mission has no mapping"
+        yield scenario.problem(("localisation",), message, suggestion="add mapping, or leave localisation out")
+    if mission.identification is not None and mission.localisation is None:
+        message = "spectra are taken round the estimated source, and the mission has no localisation"
+        yield scenario.problem(("identification",), message, suggestion="add localisation, or leave identification out")

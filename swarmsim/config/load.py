@@ -7,9 +7,9 @@ from typing import Any
 from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS, kind_of_model
-from swarmsim.config.documents import Document, read_file
+from swarmsim.config.documents import Document, Place, read_file
 from swarmsim.config.errors import InputError, Problem
-from swarmsim.config.names import did_you_mean
+from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.validation import validate
 
@@ -95,7 +95,7 @@ def _extended(path: Path, kind: str | None, chain: tuple[Path, ...]) -> Document
     merged = Document(base.data, base.marks, (path, *base.files))
     merged.marks[()] = document.marks[()]
     document.data.pop("extends")
-    _merge(merged, document, merged.data, document.data, ())
+    _merge(merged, document, merged.data, document.data, (), ())
     return merged
 
 
@@ -120,13 +120,41 @@ def _parent_path(document: Document, kind: str, parent: str, path: Path) -> Path
     raise InputError([problem])
 
 
-def _merge(into: Document, source: Document, old: dict[str, Any], new: dict[str, Any], place: tuple[str, ...]) -> None:
-    """Merge mappings deeply; lists and single values replace those below them."""
+def _merge(into: Document, source: Document, old: Any, new: dict[str, Any], place: Place, origin: Place) -> None:
+    """Merge mappings deeply; lists and single values replace those below them.
+
+    A mapping over a list changes the items that it names (``phases: {survey: {time_limit_s: 300}}``). ``place`` is
+    where ``old`` stands in the merged document, ``origin`` is where ``new`` stands in its own.
+    """
     for key, value in new.items():
-        here = (*place, key)
-        if isinstance(value, dict) and isinstance(old.get(key), dict):
-            into.marks[here] = source.marks[here]
-            _merge(into, source, old[key], value, here)
+        there = (*origin, key)
+        known = _place_in(into, source, old, key, there)
+        here = (*place, known)
+        below = old.get(known) if isinstance(old, dict) else old[known]
+        if isinstance(value, dict) and (isinstance(below, dict) or _items_named(below)):
+            into.marks[here] = source.marks[there]
+            _merge(into, source, below, value, here, there)
         else:
-            old[key] = value
-            into.replace(here, {p: m for p, m in source.marks.items() if p[: len(here)] == here})
+            old[known] = value
+            marks = {(*here, *p[len(there) :]): m for p, m in source.marks.items() if p[: len(there)] == there}
+            into.replace(here, marks)
+
+
+def _place_in(into: Document, source: Document, old: Any, key: str, there: Place) -> str | int:
+    """The key of a mapping, or the index of the item of a list that has this name."""
+    if isinstance(old, dict):
+        return key
+    names = _items_named(old)
+    if key in names:
+        return names.index(key)
+    hint = did_you_mean(key, names)
+    raise InputError(
+        [source.problem(there, f"there is no item '{key}' to change", allowed=one_of(names), suggestion=hint)]
+    )
+
+
+def _items_named(value: Any) -> list[str]:
+    """Names of the items of a list of named mappings; empty for anything else."""
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        return []
+    return [str(item.get("name")) for item in value]

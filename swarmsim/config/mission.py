@@ -1,12 +1,35 @@
-"""A mission as a user writes it: the site, the team, the sources and the three phases."""
+"""A mission as a user writes it: the site, the team, the sources and the phases."""
 
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field, model_validator
 
-from swarmsim.config.base import ConvexPolygon, Fraction, Model, Name, NonNegative, Positive, Vec2
+from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec2
 from swarmsim.config.radiation import Detector, Material, Nuclide
 from swarmsim.config.vehicles import Vehicle
+
+TEAM_MAX = 2000  # vehicles of a mission, formations expanded
+PHASES_MAX = 64
+
+
+class Timing(Model):
+    """Periods of a mission, s; the other periods are whole numbers of ``control_period_s``.
+
+    ``physics_steps`` is the number of time steps in a control period, ``judge_period_s`` is how often events, ground,
+    traffic and wind are evaluated, ``log_period_s`` how often the state is recorded, and ``decision_period_s`` how
+    often phases may start or end and planners may be asked again.
+    """
+
+    control_period_s: float = Field(default=0.01, ge=0.001, le=0.05)
+    physics_steps: int = Field(default=2, ge=1, le=20)
+    judge_period_s: float = Field(default=0.05, ge=0.001, le=1)
+    log_period_s: float = Field(default=0.1, ge=0.001, le=60)
+    decision_period_s: float = Field(default=1.0, ge=0.001, le=60)
+
+    @property
+    def time_step_s(self) -> float:
+        """Time step of the physics, s."""
+        return self.control_period_s / self.physics_steps
 
 
 class Source(Model):
@@ -18,13 +41,25 @@ class Source(Model):
     activity_mbq: NonNegative
 
 
+class Formation(Model):
+    """Members in a grid: rows of ``columns`` eastwards from the first member, further rows northwards."""
+
+    count: int = Field(ge=2, le=TEAM_MAX)
+    columns: int = Field(ge=1)
+    spacing_m: Positive
+
+
 class TeamMember(Model):
-    """One vehicle of the team: its type and where it starts (ENU, heading counter-clockwise from east)."""
+    """One vehicle of the team: its type and where it starts (ENU, heading counter-clockwise from east).
+
+    With a ``formation`` it stands for ``count`` vehicles named ``name1``, ``name2``, …, the first at ``position_m``.
+    """
 
     name: Name
     type: Name
     position_m: Vec2
     heading_deg: float = Field(default=0.0, ge=-360, le=360)
+    formation: Formation | None = None
 
 
 class Wind(Model):
@@ -38,25 +73,28 @@ class Wind(Model):
     gusts: bool = False
 
 
-class Aerial(Model):
-    """Phase 1: the survey flight."""
+class Traffic(Model):
+    """Least distances, m, between UAVs in flight, between rovers, and between vehicles' outlines at the start."""
 
-    policy: Name = "parallel_lines"
-    altitude_m: float = Field(gt=1, le=200)
-    line_spacing_m: Positive | None = None
-    sweep_deg: float = Field(default=0.0, ge=-360, le=360)
-    speed_m_s: float = Field(gt=0, le=30)
-    climb_speed_m_s: float = Field(gt=0, le=10)
-    descent_speed_m_s: float = Field(gt=0, le=5)
-    touchdown_speed_m_s: float = Field(gt=0, le=2)
-    obstacle_clearance_m: NonNegative
-    separation_m: Positive
-    area_m: ConvexPolygon | None = None
-    time_limit_s: Positive
+    separation_m: Positive = 6.0
+    ground_separation_m: NonNegative = 2.0
+    pad_gap_m: NonNegative = 0.5
+
+
+class Radio(Model):
+    """What team mates hear of each other: range (unlimited without one), share of lost messages, delay.
+
+    ``mates`` is how many team mates, the nearest in range, a policy sees.
+    """
+
+    range_m: Positive | None = None
+    loss: Fraction = 0.0
+    delay_s: float = Field(default=0.0, ge=0, le=10)
+    mates: int = Field(default=8, ge=1, le=64)
 
 
 class Mapping(Model):
-    """Phase 2a: counts to a map, map to hotspots."""
+    """Counts to a map, map to hotspots."""
 
     cell_m: Positive
     length_scale_m: Positive
@@ -66,7 +104,7 @@ class Mapping(Model):
 
 
 class Localisation(Model):
-    """Phase 2b and 3b: estimate of position and activity from the likelihood of the counts."""
+    """Estimate of a source's position and activity from the likelihood of the counts."""
 
     presumed_nuclide: Name
     presumed_height_m: float = Field(ge=-5, le=100)
@@ -83,17 +121,59 @@ class Localisation(Model):
     samples: int = Field(default=64, ge=16, le=10_000)
 
 
-class Ground(Model):
-    """Phase 3: the rover's drive to the hotspot and around it."""
+class Identification(Model):
+    """Nuclide from the spectra taken within ``spectrum_radius_m`` of the estimated source.
 
-    policy: Name = "approach_and_orbit"
-    speed_m_s: float = Field(gt=0, le=5)
-    standoff_m: Positive
-    viewpoints: int = Field(ge=1, le=64)
-    laps: int = Field(default=1, ge=1, le=10)
-    time_limit_s: Positive
+    A nuclide is named when its confidence is at least ``confidence_min``.
+    """
+
     spectrum_radius_m: Positive
     confidence_min: Fraction
+
+
+class Trigger(Model):
+    """When a phase starts or ends: at a time, when another phase ends, or when something is found.
+
+    ``delay_s`` is added to any of the three.
+    """
+
+    at_s: NonNegative | None = None
+    after: Name | None = None
+    when: Literal["hotspot"] | None = None
+    delay_s: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _one_condition(self) -> "Trigger":
+        if sum(condition is not None for condition in (self.at_s, self.after, self.when)) != 1:
+            raise ValueError("give exactly one of at_s (a time), after (a phase) and when (hotspot)")
+        return self
+
+
+def _as_tuple(who: Any) -> Any:
+    """One name stands for a list of one."""
+    return (who,) if isinstance(who, str) else tuple(who) if isinstance(who, list) else who
+
+
+class Phase(Model):
+    """A part of the mission: who follows which policy, and from when to when.
+
+    ``who`` are names of members, of formations, of vehicle types, of kinds (multirotor, skid_steer), or ``all``.
+    ``policy`` is the name of a policy, ``file.py:object``, ``package.module:object``, or an entry point of the group
+    ``swarmsim.policies``. ``settings`` are those of the policy. A phase that starts takes over its vehicles from an
+    earlier one. It ends when each of its vehicles has done its task, at ``end``, or ``time_limit_s`` after its start.
+    """
+
+    name: Name
+    who: Annotated[
+        tuple[Name, ...],
+        Field(min_length=1, max_length=TEAM_MAX),
+        BeforeValidator(_as_tuple, json_schema_input_type=Name | tuple[Name, ...]),
+    ]
+    policy: str = Field(min_length=1)
+    settings: dict[str, Any] = Field(default_factory=dict)
+    start: Trigger = Trigger(at_s=0.0)
+    end: Trigger | None = None
+    time_limit_s: Positive
 
 
 class Definitions(Model):
@@ -112,7 +192,9 @@ class Definitions(Model):
 class Mission(Model):
     """A scenario (``configs/missions/<name>.yaml``).
 
-    ``versions`` says what wrote a resolved scenario (package -> version); it changes nothing in the mission.
+    Without ``mapping`` there is no radiation map, without ``localisation`` no source is estimated, without
+    ``identification`` no nuclide is named. ``versions`` says what wrote a resolved scenario (package -> version); it
+    changes nothing in the mission.
     """
 
     name: Name
@@ -120,14 +202,16 @@ class Mission(Model):
     site: Name
     seed: int = Field(default=0, ge=0, lt=2**31)
     engine: Literal["mjx", "analytic"] = "mjx"
-    time_step_s: float = Field(default=0.005, ge=0.0005, le=0.02)
     detection: Literal["physical", "paper_ideal"] = "physical"
+    timing: Timing = Timing()
     sources: tuple[Source, ...] = Field(max_length=16)
-    vehicles: tuple[TeamMember, ...] = Field(min_length=1, max_length=64)
-    wind: Wind
-    aerial: Aerial
-    mapping: Mapping
-    localisation: Localisation
-    ground: Ground
+    vehicles: tuple[TeamMember, ...] = Field(min_length=1, max_length=TEAM_MAX)
+    wind: Wind = Wind()
+    traffic: Traffic = Traffic()
+    radio: Radio = Radio()
+    mapping: Mapping | None = None
+    localisation: Localisation | None = None
+    identification: Identification | None = None
+    phases: tuple[Phase, ...] = Field(min_length=1, max_length=PHASES_MAX)
     definitions: Definitions = Definitions()
     versions: dict[str, str] = Field(default_factory=dict)

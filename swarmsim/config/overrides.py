@@ -1,4 +1,4 @@
-"""Dotted overrides from the command line: ``aerial.altitude_m=30``, ``sources.0.activity_mbq=50``."""
+"""Dotted overrides from the command line: ``wind.speed_m_s=3``, ``phases.survey.settings.altitude_m=30``."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from swarmsim.config.allowed import Shape
 from swarmsim.config.documents import Document, Mark, Place, dotted, parse_value
 from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.former import former_override
 from swarmsim.config.names import did_you_mean, one_of
 
 ORIGIN = "--set"
@@ -31,12 +32,15 @@ def _apply(document: Document, text: str, shape: Shape) -> None:
     steps = path.strip().split(".")
     if not equals or not all(steps):
         raise InputError.of(
-            "is not of the form path=value", file=ORIGIN, given=text, suggestion=f"e.g. {ORIGIN} aerial.altitude_m=30"
+            "is not of the form path=value", file=ORIGIN, given=text, suggestion=f"e.g. {ORIGIN} wind.speed_m_s=3"
         )
     try:
         value = parse_value(value_text)
     except InputError as error:
         raise InputError([_at(tuple(steps), p.message, given=value_text) for p in error.problems]) from None
+    former = former_override(tuple(steps), value, document.data)
+    if former is not None and shape.at((steps[0],), document.data) is None:
+        raise InputError([_at(tuple(steps), f"is now {former[0]}", suggestion=f"write {ORIGIN} {former[1]}")])
     place: Place = ()
     node: Any = document.data
     for i, step in enumerate(steps):

@@ -43,7 +43,7 @@ class Material(Model):
     """A material (``configs/materials/<name>.yaml``): bulk density and mass attenuation against energy.
 
     An energy written twice is an absorption edge: the first value holds below it, the second above. The last two
-    fields are needed only to derive ``build_up`` with ``python -m swarmsim.radiation.build_up``.
+    fields are needed only to derive ``build_up`` with ``configs/materials/generate_build_up.py`` of the repository.
     """
 
     name: Name

@@ -1,55 +1,81 @@
 """A scenario: a mission with everything that it names looked up, checked and held together."""
 
 import hashlib
-import importlib.metadata
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from swarmsim.config import files
 from swarmsim.config.allowed import item, shape_of
-from swarmsim.config.checks import check_consistency, check_detectors, check_references, known_names
+from swarmsim.config.checks import (
+    check_consistency,
+    check_detectors,
+    check_references,
+    check_team_size,
+    known_names,
+)
 from swarmsim.config.documents import Document, Place, dump_yaml
 from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.load import load_named, read_document
-from swarmsim.config.mission import Mission
+from swarmsim.config.mission import Mission, TeamMember
 from swarmsim.config.overrides import ORIGIN, apply_overrides
+from swarmsim.config.phases import read_settings
+from swarmsim.config.policies import PolicySettings
 from swarmsim.config.radiation import Detector, Material, Nuclide
 from swarmsim.config.site import SiteSpec
+from swarmsim.config.team import chosen, expand_team, groups
 from swarmsim.config.validation import validate
 from swarmsim.config.vehicles import Multirotor, SkidSteer
+from swarmsim.versions import package_versions
 
-_VERSIONED = ("swarmsim", "jax", "mujoco", "mujoco-mjx", "numpy")
+_VERSIONED = ("jax", "mujoco", "mujoco-mjx", "numpy")
 
 
 @dataclass(frozen=True)
 class Scenario:
     """A mission ready to be built. Mappings are read-only and in the order of their names."""
 
-    mission: Mission
-    vehicles: tuple[Multirotor | SkidSteer, ...]  # type of each member of mission.vehicles, in that order
+    mission: Mission  # with the settings of every phase written out
+    members: tuple[TeamMember, ...]  # the team, formations expanded
+    entries: tuple[int, ...]  # index in mission.vehicles of each member
+    vehicles: tuple[Multirotor | SkidSteer, ...]  # type of each member
+    settings: tuple[PolicySettings, ...]  # of the policy of each phase
     detectors: Mapping[str, Detector]  # those that the team carries
     nuclides: Mapping[str, Nuclide]  # the whole library
     materials: Mapping[str, Material]  # the whole library
     site: SiteSpec
     site_file: Path  # site.yaml; the site's mesh or elevation model is named relative to its folder
+    mission_file: Path | None = field(compare=False)  # policies in files are named relative to its folder
     document: Document = field(repr=False, compare=False)  # where each value stands, for messages
+
+    @cached_property
+    def groups(self) -> dict[str, tuple[int, ...]]:
+        """What a phase's ``who`` may name, and the indices of the members that it means."""
+        return groups(self.mission, self.members, self.entries, self.vehicles)
+
+    @cached_property
+    def phase_members(self) -> tuple[tuple[int, ...], ...]:
+        """Indices of the members of each phase, in the order of the team."""
+        return tuple(chosen(phase.who, self.groups) for phase in self.mission.phases)
 
     def problem(self, place: Place, message: str, **details: str | None) -> Problem:
         """A `Problem` about the mission's value at ``place``, e.g. ``("sources", 0, "position_m")``."""
         return self.document.problem(place, message, **details)
 
     def to_yaml(self) -> str:
-        """The scenario fully resolved: every default, vehicle, detector, nuclide and material written out.
+        """The scenario fully resolved: every default, setting, vehicle, detector, nuclide and material written out.
 
-        `load_scenario` reads it back to the same mission. The site stays a name; the hash of its files is among the
-        ``versions`` (``site_sha256``).
+        `load_scenario` reads it back to the same mission, wherever it lies: the file of a user's policy is named by its
+        absolute path where the working folder does not lead to it. The site stays a name; the hashes of its files and
+        of users' policies are among the ``versions`` (``site_sha256``, ``policy_sha256.<policy>``).
         """
         data = self.mission.model_dump(mode="json", exclude_none=True)
-        types = {member.type: vehicle for member, vehicle in zip(self.mission.vehicles, self.vehicles, strict=True)}
+        for phase in data["phases"]:
+            phase["policy"] = _found_from_anywhere(phase["policy"], self.mission_file)
+        types = {member.type: vehicle for member, vehicle in zip(self.members, self.vehicles, strict=True)}
         libraries: dict[str, Mapping[str, Any]] = {
             "vehicles": types,
             "detectors": self.detectors,
@@ -65,25 +91,25 @@ class Scenario:
         return dump_yaml(data)
 
     def versions(self) -> dict[str, str]:
-        """What this scenario runs with: Python, the packages that decide results, and the hash of the site's files."""
-        found = {"python": platform.python_version()}
-        for package in _VERSIONED:
-            try:
-                found[package] = importlib.metadata.version(package)
-            except importlib.metadata.PackageNotFoundError:
-                found[package] = "not installed"
+        """What this scenario runs with: Python, the packages that decide results, hashes of site and policy files."""
+        from swarmsim.policies import registry
+
         digest = hashlib.sha256(self.site_file.read_bytes())
         geometry = self.site_file.parent / self.site.file
         if geometry.is_file():
             digest.update(geometry.read_bytes())
-        return found | {"site_sha256": digest.hexdigest()}
+        found = package_versions(_VERSIONED) | {"site_sha256": digest.hexdigest()}
+        for policy in dict.fromkeys(phase.policy for phase in self.mission.phases):
+            if sha256 := registry.digest(policy, self.mission_file):
+                found[f"policy_sha256.{_found_from_anywhere(policy, self.mission_file)}"] = sha256
+        return found
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:
     """The scenario of a shipped mission's name or of a mission file, with ``path=value`` overrides and a seed.
 
-    Raises `InputError` with everything that is wrong with it, apart from what needs the site's geometry
-    (`swarmsim.config.geometry.check_geometry`).
+    Raises `InputError` with everything that is wrong with it, apart from what needs the site's ground
+    (`swarmsim.config.site_checks.check_site`).
     """
     path = files.find("missions", name_or_path)
     document = read_document(path, "missions")
@@ -93,30 +119,47 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
         apply_overrides(document, overrides, shape_of(Mission))
     except InputError as error:
         problems += error.problems
-    return _resolve(document, path, problems)
+    return resolve(document, path, problems)
 
 
 def scenario_of(mission: Mission, near: Path | None = None) -> Scenario:
-    """The scenario of a mission made in Python; ``near`` is a file beside whose ``configs`` names are looked up."""
-    return _resolve(Document(mission.model_dump(mode="json", exclude_none=True)), near, [])
+    """The scenario of a mission made in Python.
+
+    ``near`` is a file beside whose ``configs`` names are looked up, and in whose folder files of policies are.
+    """
+    return resolve(Document(mission.model_dump(mode="json", exclude_none=True)), near, [])
 
 
-def _resolve(document: Document, near: Path | None, problems: list[Problem]) -> Scenario:
+def resolve(document: Document, near: Path | None, problems: list[Problem]) -> Scenario:
+    """The scenario of a mission's document; ``problems`` are those found already. Raises `InputError`."""
     mission: Mission | None = None
     try:
         mission = validate(document, Mission)
+        problems += check_team_size(mission, document)
     except InputError as error:
         problems += error.problems
+    settings, of_settings = read_settings(document, near)
     at_fault = {problem.path for problem in problems}
-    problems += [problem for problem in check_references(document, near) if problem.path not in at_fault]
+    others = (*check_references(document, near), *of_settings)
+    problems += [problem for problem in others if problem.path not in at_fault]
     raise_if_any(sorted(problems, key=lambda p: (p.file != ORIGIN, p.file or "", p.line or 0)))
     assert mission is not None
-    found = _look_up(mission, document, near)
-    raise_if_any(check_consistency(mission, found.vehicles, found.detectors, found.materials, found.site, document))
-    return found
+    complete = tuple(each for each in settings if each is not None)
+    scenario = _look_up(_with_settings(mission, complete), complete, document, near)
+    raise_if_any(check_consistency(scenario))
+    return scenario
 
 
-def _look_up(mission: Mission, document: Document, near: Path | None) -> Scenario:
+def _with_settings(mission: Mission, settings: tuple[PolicySettings, ...]) -> Mission:
+    """The mission with every setting of its policies written out."""
+    phases = tuple(
+        phase.model_copy(update={"settings": each.model_dump(mode="json", exclude_none=True)})
+        for phase, each in zip(mission.phases, settings, strict=True)
+    )
+    return mission.model_copy(update={"phases": phases})
+
+
+def _look_up(mission: Mission, settings: tuple[PolicySettings, ...], document: Document, near: Path | None) -> Scenario:
     """Everything that the mission names, loaded; the names are known to exist, but the files may be wrong."""
     own = mission.definitions
     problems: list[Problem] = []
@@ -144,21 +187,36 @@ def _look_up(mission: Mission, document: Document, near: Path | None) -> Scenari
         problems += error.problems
     raise_if_any(problems)
     assert site is not None
-    vehicles = tuple(types[member.type] for member in mission.vehicles)
-    raise_if_any(check_detectors(mission, vehicles, document, near))
-    carried = sorted({vehicle.detector.model for vehicle in vehicles if vehicle.detector is not None})
+    raise_if_any(check_detectors(mission, [types[entry.type] for entry in mission.vehicles], document, near))
+    carried = sorted({vehicle.detector.model for vehicle in types.values() if vehicle.detector is not None})
     detectors = {name: gather("detectors", name) for name in carried}
     raise_if_any(problems)
+    members, entries = expand_team(mission)
     return Scenario(
         mission=mission,
-        vehicles=vehicles,
+        members=members,
+        entries=entries,
+        vehicles=tuple(types[member.type] for member in members),
+        settings=settings,
         detectors=MappingProxyType(detectors),
         nuclides=MappingProxyType(nuclides),
         materials=MappingProxyType(materials),
         site=site,
         site_file=site_file,
+        mission_file=near,
         document=document,
     )
+
+
+def _found_from_anywhere(policy: str, near: Path | None) -> str:
+    """The reference of a policy, with the absolute path of its file where the working folder does not lead to it."""
+    from swarmsim.policies import registry
+
+    path = registry.policy_file(policy, near)
+    if path is None:
+        return policy
+    file, _, name = policy.rpartition(":")
+    return policy if (Path.cwd() / file).resolve() == path else f"{path}:{name}"
 
 
 def _bring_in_definitions(document: Document, overrides: Sequence[str], near: Path) -> list[Problem]:

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec2
+from swarmsim.config.base import ConvexPolygon, Fraction, Model, Name, NonNegative, Positive, Vec2
 
 Polygon = Annotated[tuple[Vec2, ...], Field(min_length=3, max_length=32)]
 
@@ -71,7 +71,7 @@ class SiteSpec(Model):
     obstacles: tuple[ObstacleMaterial, ...] = ()
     default_material: Name = "concrete"
     zones: tuple[Zone, ...] = ()
-    survey_area_m: Polygon | None = None
+    survey_area_m: ConvexPolygon | None = None
     traversability: Traversability = Traversability()
     orthophoto: str | None = None
 

@@ -10,6 +10,8 @@ from pydantic_core import ErrorDetails
 from swarmsim.config.allowed import Shape, item, shape_of
 from swarmsim.config.documents import Document, Place, dump_yaml
 from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.former import former_problems
+from swarmsim.config.mission import Mission
 from swarmsim.config.names import did_you_mean, one_of
 
 _NOT = {
@@ -44,15 +46,19 @@ def validate(document: Document, cls: Any) -> Any:
 def problems_of(error: ValidationError, document: Document, cls: Any) -> list[Problem]:
     """Each error of a `ValidationError` as a `Problem`, in the order of the lines; one for each place."""
     shape = shape_of(cls)
+    former = former_problems(document) if cls is Mission else []
+    explained = {tuple((problem.path or "").split("."))[:1] for problem in former}
     found: dict[Place, Problem] = {}
     for details in error.errors(include_url=False):
         place = _place(details, document.data)
+        if place in explained or (former and place == ("phases",) and details["type"] == "missing"):
+            continue
         if details["type"] == "too_short" and any(p[: len(place)] == place and p != place for p in found):
             continue  # pydantic counts only the items that passed: the items' own problems say more
         if isinstance(place[-1] if place else None, int) and details["type"] == "missing":
             place = place[:-1]
         found.setdefault(place, _problem(details, place, document, shape))
-    return sorted(found.values(), key=lambda problem: problem.line or 0)
+    return sorted([*former, *found.values()], key=lambda problem: problem.line or 0)
 
 
 def _place(details: ErrorDetails, data: Any) -> Place:
@@ -90,7 +96,7 @@ def _problem(details: ErrorDetails, place: Place, document: Document, shape: Sha
             allowed=one_of(tags) if tags else "one of multirotor, skid_steer",
             suggestion=did_you_mean(value, tags or ()) if value else None,
         )
-    choices = _choices(allowed)
+    choices = shape.choices(place, data)
     suggestion = did_you_mean(given, choices) if given and kind == "literal_error" else _hint(details["input"], kind)
     return document.problem(place, _message(details), given=given, allowed=allowed, suggestion=suggestion)
 
@@ -118,10 +124,6 @@ def _message(details: ErrorDetails) -> str:
     if kind == "int_from_float":
         return "is not a whole number"
     return f"is not {_NOT[word]}" if (word := kind.removesuffix("_type")) in _NOT else details["msg"]
-
-
-def _choices(allowed: str | None) -> list[str]:
-    return allowed.removeprefix("one of ").split(", ") if allowed else []
 
 
 def _hint(value: Any, kind: str) -> str | None:

@@ -237,3 +237,4 @@ class SkidSteer(Sourced):
 
 
 Vehicle = Annotated[Multirotor | SkidSteer, Field(discriminator="kind")]
+VEHICLE_KINDS: tuple[str, ...] = ("multirotor", "skid_steer")

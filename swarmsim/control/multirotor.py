@@ -1,6 +1,6 @@
 """Cascaded control of a multirotor: position, velocity, attitude, body rate, rotor thrusts.
 
-The structure is that of PX4 and of Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control", IEEE
+A command may enter at any of the four levels of `swarmsim.control.commands`. The structure is that of PX4 and of Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control", IEEE
 Transactions on Control Systems Technology 28(2), 2020: the tilt, which carries the thrust, comes before the yaw.
 World ENU, body FLU, SI units; one vehicle. Run it every 10 ms.
 """
@@ -8,7 +8,8 @@ World ENU, body FLU, SI units; one vehicle. Run it every 10 ms.
 import jax
 import jax.numpy as jnp
 
-from swarmsim.physics.rigid_body import rotation_matrix, to_body
+from swarmsim.control.commands import ATTITUDE, BODY_RATE, POSITION, MultirotorCommand, PositionCommand
+from swarmsim.physics.rotations import conjugate, multiply, rotation_matrix, to_body
 from swarmsim.pytree import pytree
 from swarmsim.vehicles.multirotor import ControlParams, MultirotorParams
 from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
@@ -20,19 +21,11 @@ LANDED_AFTER_S = 0.4
 LANDED_LOAD = 0.02
 """Load on the landing gear, over the weight, from which it feels the ground."""
 LANDED_DESCENT_M_S = 0.2
-"""Commanded descent that a flying vehicle would follow."""
+"""Minimum commanded descent rate for landing detection."""
 LANDED_SPEED_M_S = 0.15
-"""Speed below which it does not."""
+"""Maximum speed for landing detection."""
 
-
-@pytree
-class Setpoint:
-    """Where a multirotor should be, with its velocity and acceleration fed forward."""
-
-    position_m: jax.Array  # [3] m, world
-    velocity_m_s: jax.Array  # [3] m/s, world
-    acceleration_m_s2: jax.Array  # [3] m/s^2, world
-    yaw_rad: jax.Array  # [] rad, counter-clockwise from east
+Setpoint = PositionCommand
 
 
 @pytree
@@ -56,25 +49,53 @@ def is_landed(memory: ControlMemory) -> jax.Array:
 
 
 def control(
-    params: MultirotorParams, memory: ControlMemory, state: MultirotorState, setpoint: Setpoint, dt: float
+    params: MultirotorParams,
+    memory: ControlMemory,
+    state: MultirotorState,
+    command: MultirotorCommand | PositionCommand,
+    dt: float,
 ) -> tuple[jax.Array, ControlMemory]:
-    """Rotor commands [R] rad/s towards ``setpoint`` and the controller's memory ``dt`` s later.
+    """Rotor commands [R] rad/s that follow ``command``, and the controller's memory ``dt`` s later.
 
-    Only ``params.control`` is read: the controller does not know the true mass. As on a real autopilot, a descent that
-    the ground stops is a landing: the commands are then zero, which disarms the rotors, until a climb is commanded.
+    Only ``params.control`` is read: the controller does not know the true mass. As on a real autopilot, a position
+    command whose descent the ground stops is a landing: the rotors are disarmed (commands of zero) until a climb is
+    commanded. Commands below the position level are obeyed without that, and leave the integral as it is.
     """
     autopilot, body = params.control, state.body
     touching = state.ground_force_n > LANDED_LOAD * GRAVITY_M_S2 * autopilot.mass_kg
-    acceleration, memory = _acceleration(autopilot, memory, body, touching, setpoint, dt)
+    acceleration, after = _acceleration(autopilot, memory, body, touching, command, dt)
     pull = acceleration + jnp.array([0.0, 0.0, GRAVITY_M_S2], acceleration.dtype)
     attitude = rotation_matrix(body.quaternion)
     pull_body = to_body(attitude, pull)
-    rate = _body_rate(autopilot, attitude, pull_body, setpoint.yaw_rad)
+    rate = _body_rate(autopilot, attitude, pull_body, command.yaw_rad)
+    thrust = autopilot.mass_kg * jnp.maximum(pull_body[2], 0.0)
+    if isinstance(command, PositionCommand):
+        speeds = _rotor_speeds_of(autopilot, body, rate, thrust)
+        return jnp.where(is_landed(after), 0.0, speeds), after
+    at_position = command.level == POSITION
+    wanted = jnp.where(command.level == ATTITUDE, _attitude_rate(autopilot, body, command), command.body_rate_rad_s)
+    rate = jnp.where(at_position, rate, wanted)
+    thrust = jnp.where(at_position, thrust, jnp.maximum(command.thrust_n, 0.0))
+    speeds = _rotor_speeds_of(autopilot, body, rate, thrust)
+    speeds = jnp.where(at_position & is_landed(after), 0.0, speeds)
+    memory = jax.tree.map(lambda new, old: jnp.where(at_position, new, old), after, memory)
+    return jnp.where(command.level <= BODY_RATE, speeds, command.rotor_speed_rad_s), memory
+
+
+def _rotor_speeds_of(autopilot: ControlParams, body: RigidState, rate: jax.Array, thrust: jax.Array) -> jax.Array:
+    """Rotor speeds [R] rad/s for body rates [3] rad/s and a collective thrust [] N."""
     w, inertia = body.angular_velocity_rad_s, autopilot.inertia_kg_m2
     torque = inertia * autopilot.rate_gain_1_s * (rate - w) + jnp.cross(w, inertia * w)
-    thrust = autopilot.mass_kg * jnp.maximum(pull_body[2], 0.0)
-    commands = rotor_commands(autopilot, thrust, torque)
-    return jnp.where(is_landed(memory), 0.0, commands), memory
+    return rotor_commands(autopilot, thrust, torque)
+
+
+def _attitude_rate(autopilot: ControlParams, body: RigidState, command: MultirotorCommand) -> jax.Array:
+    """Body rate [3] rad/s towards the commanded attitude: twice the error quaternion's vector part, by the gains."""
+    error = multiply(conjugate(body.quaternion), command.quaternion)
+    vector = 2.0 * jnp.where(error[0] < 0.0, -1.0, 1.0) * error[1:]
+    limit = autopilot.yaw_rate_max_rad_s
+    turn = jnp.clip(autopilot.yaw_gain_1_s * vector[2], -limit, limit)
+    return jnp.stack([autopilot.attitude_gain_1_s * vector[0], autopilot.attitude_gain_1_s * vector[1], turn])
 
 
 def rotor_commands(autopilot: ControlParams, thrust_n: jax.Array, torque_nm: jax.Array) -> jax.Array:
@@ -107,11 +128,12 @@ def _acceleration(
     memory: ControlMemory,
     body: RigidState,
     touching: jax.Array,
-    setpoint: Setpoint,
+    setpoint: MultirotorCommand | PositionCommand,
     dt: float,
 ) -> tuple[jax.Array, ControlMemory]:
     """Wanted acceleration [3] m/s^2 (world) within the limits; the integral stands still where it would wind up."""
-    approach = autopilot.position_gain_1_s * (setpoint.position_m - body.position_m)
+    offset = setpoint.position_m - body.position_m
+    approach = autopilot.position_gain_1_s * setpoint.hold_position * offset
     limits = jnp.stack([autopilot.speed_max_m_s, autopilot.climb_rate_max_m_s])
     velocity = _limited(setpoint.velocity_m_s + approach, limits)
     error = velocity - body.velocity_m_s

@@ -1,4 +1,4 @@
-"""From a target to wheel commands: pure pursuit, and wheel speeds that allow for slip."""
+"""Control of a skid-steer rover: pure pursuit of a target, and wheel speeds that compensate slip."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,11 @@ from swarmsim.physics.rotations import rotate_inverse, yaw_of
 from swarmsim.vehicles.skid_steer import SkidSteerParams, effective_track, turning_force
 from swarmsim.vehicles.state import SkidSteerState
 
-YAW_RATE_FEEDBACK = 0.5  # rad/s commanded more per rad/s that the rover turns too slowly
-FRICTION_ONSET_RAD_S = 0.1  # wheel speed over which the compensation of dry friction comes in
-SPEED_HORIZON_S = 0.4  # the commanded speed stays within what the rover may reach in this time
-TURN_IN_PLACE_RAD = 1.0  # a target further off the nose is turned to before driving
-ARRIVED_M = 0.02  # nearer than this there is nothing to turn to
+YAW_RATE_FEEDBACK = 0.5  # gain from the yaw-rate error to the yaw-rate command
+FRICTION_ONSET_RAD_S = 0.1  # wheel speed at which the compensation of Coulomb friction reaches 76 %
+SPEED_HORIZON_S = 0.4  # the commanded speed is limited to what the acceleration limit reaches in this time
+TURN_IN_PLACE_RAD = 1.0  # with a larger bearing to the target the rover turns on the spot before it drives
+ARRIVED_M = 0.02  # distance below which the rover stops
 
 
 def wheel_speeds(
@@ -19,10 +19,10 @@ def wheel_speeds(
 ) -> jax.Array:
     """Wheel-speed commands [4] (rad/s) for a speed ahead [] (m/s) and a yaw rate [] (rad/s, counter-clockwise).
 
-    Left and right follow from the effective track of the slipping rover, and the yaw rate that the gyroscope measures
-    is fed back. The motors' loops are proportional, so each command is raised by what it takes to hold the torque of
-    the slope (gravity as the rover's attitude shows it), of rolling and of skidding. Beyond the wheels' limit all are
-    scaled down together, which keeps the curvature.
+    Left and right follow from the effective track of the slipping rover, with feedback of the measured yaw rate. The
+    motors' speed loops are proportional, so a feedforward is added for the torques of the slope (gravity in the rover's
+    attitude), of rolling and of skidding. Above the wheels' limit all commands are scaled down together, which keeps
+    the curvature.
     """
     measured = state.body.angular_velocity_rad_s[2]
     yaw_rate = yaw_rate_rad_s + YAW_RATE_FEEDBACK * (yaw_rate_rad_s - measured)
@@ -44,12 +44,14 @@ def pursue(
 ) -> tuple[jax.Array, jax.Array]:
     """Speed ahead [] (m/s) and yaw rate [] (rad/s) to ``target_xy`` [2] (m, world) at ``speed_m_s`` [] or less.
 
-    Pure pursuit (Coulter, CMU-RI-TR-92-01): the arc through the target, tangent to the heading. A target far off the
-    nose is turned to in place. The rover slows down so as to stop at the target, takes curves no faster than its
-    yaw-rate limit allows, and changes its speed no faster than its acceleration limit.
+    Pure pursuit (Coulter, CMU-RI-TR-92-01): the arc through the target, tangent to the heading. For a large bearing the
+    rover turns in place first. The speed is limited so that it stops at the target and respects the limits of yaw rate
+    and acceleration.
     """
     offset = target_xy - state.body.position_m[:2]
     distance = jnp.sqrt(jnp.sum(offset * offset) + 1e-12)
+    arrived = distance < ARRIVED_M
+    offset = jnp.where(arrived, jnp.array([1.0, 0.0]), offset)  # the direction to zero distance has no derivative
     bearing = jnp.arctan2(offset[1], offset[0]) - yaw_of(state.body.quaternion)
     bearing = jnp.arctan2(jnp.sin(bearing), jnp.cos(bearing))
     limit = params.yaw_rate_max_rad_s
@@ -57,7 +59,6 @@ def pursue(
     stopping = jnp.sqrt(2.0 * params.acceleration_max_m_s2 * distance) * jnp.minimum(1.0, distance / 0.3)
     cruise = jnp.minimum(jnp.minimum(speed_m_s, params.speed_max_m_s), stopping)
     cruise = jnp.minimum(cruise, limit / jnp.maximum(jnp.abs(curvature), 1e-3))
-    arrived = distance < ARRIVED_M
     in_place = jnp.abs(bearing) > TURN_IN_PLACE_RAD
     present = rotate_inverse(state.body.quaternion, state.body.velocity_m_s)[0]
     change = params.acceleration_max_m_s2 * SPEED_HORIZON_S

@@ -141,16 +141,21 @@ def _pairs(bases: list[Basis], variance_kept: float, length_scale: float) -> tup
     return i, j
 
 
-def interpolate(params: MappingParams, measurements: Measurements) -> RadiationMap:
+def interpolate(params: MappingParams, measurements: Measurements, windows: jax.Array | float = 1.0) -> RadiationMap:
     """Map of the count rate from counts at known places (one detector type, one height above ground).
 
     The background level is the median of a kernel-smoothed rate over the windows; the noise of a window is the
     Poisson variance at its smoothed (not its own) count, as weights from own counts would favour low draws; the
     prior's variance is the mean square of the smoothed excess (empirical Bayes), at least the noise of one window.
     All are finite for any input; without a valid sample the map is 0 ± 1 and insignificant.
+
+    Args:
+        params: grid and basis.
+        measurements: n counting windows, or sums of several.
+        windows: how many windows each row [n] is the sum of; the levels are those of the single windows.
     """
     m = cleared(measurements)
-    rate, noise, background, variance = _levels(params, m)
+    rate, noise, background, variance = _levels(params, m, jnp.where(m.valid, windows, 0.0))
     mean, var, gain, noise_var = posterior(params, m, rate, noise, background, variance)
     return RadiationMap(
         mean_cps=mean,
@@ -167,8 +172,13 @@ def _kernels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Arr
     return kx, ky
 
 
-def _levels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Rate [n], its noise variance [n], background level [] and prior variance [] from kernel-smoothed counts."""
+def _levels(
+    params: MappingParams, m: Measurements, windows: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Rate [n], its noise variance [n], background level [] and prior variance [] from kernel-smoothed counts.
+
+    Each row counts as ``windows`` [n] windows, 0 where it is not valid.
+    """
     counts, exposure = m.counts, m.exposure_s
     kx, ky = _kernels(params, m)
 
@@ -179,15 +189,20 @@ def _levels(params: MappingParams, m: Measurements) -> tuple[jax.Array, jax.Arra
     live = jnp.where(m.valid, m.exposure_s, 1.0)
     # A window expected to hold less than one count is given the variance of one: its rate is known no better.
     noise = jnp.maximum(smoothed * live, 1.0) / (live * live)
-    number = jnp.sum(m.valid)
-    ordered = jnp.sort(jnp.where(m.valid, smoothed, jnp.inf))
-    middle = jnp.stack([ordered[jnp.maximum(number - 1, 0) // 2], ordered[jnp.minimum(number // 2, ordered.size - 1)]])
+    number = jnp.sum(windows)
+    order = jnp.argsort(jnp.where(m.valid, smoothed, jnp.inf))
+    ordered, below = smoothed[order], jnp.cumsum(windows[order])
+    # Windows number (N - 1) / 2 and N / 2, rounded down and counted from 0: the median of N.
+    half = jnp.stack([jnp.maximum(number - 1.0, 0.0) // 2.0, number // 2.0])
+    middle = ordered[jnp.minimum(jnp.sum(below[:, None] <= half, axis=0), ordered.size - 1)]
     background = jnp.where(number > 0, jnp.mean(middle), 0.0)
-    share = m.valid / jnp.maximum(number, 1)
+    share = windows / jnp.maximum(number, 1.0)
+    each = live / jnp.maximum(windows, 1.0)
     excess = jnp.sum(share * (smoothed - background) ** 2)
     # At least the noise of one window: an unmeasured place is not known better than one measured once. At most what
     # normal equations in float32 can hold.
-    scale = jnp.where(number > 0, jnp.sum(share * noise), 1.0)
+    window_noise = jnp.maximum(smoothed * each, 1.0) / (each * each)
+    scale = jnp.where(number > 0, jnp.sum(share * window_noise), 1.0)
     variance = jnp.where(number > 0, jnp.clip(excess, scale, 1e3 * scale), 1.0)
     return counts / live, noise, background, variance
 
@@ -267,5 +282,6 @@ def _significance(excess: jax.Array, gain: jax.Array, noise_var: jax.Array, back
     relative = jnp.where(known, excess / (jnp.where(known, gain, 1.0) * level), 0.0)
     relative = jnp.maximum(relative, -0.999)
     expected = level * level * gain**2 / jnp.where(known, noise_var, 1.0)
-    half_deviance = (1.0 + relative) * jnp.log1p(relative) - relative
-    return jnp.where(known, jnp.sign(relative) * jnp.sqrt(2.0 * expected * jnp.maximum(half_deviance, 0.0)), 0.0)
+    deviance = 2.0 * expected * ((1.0 + relative) * jnp.log1p(relative) - relative)
+    apart = known & (deviance > 0.0)  # the gradient of a root ends at zero
+    return jnp.where(apart, jnp.sign(relative) * jnp.sqrt(jnp.where(apart, deviance, 1.0)), 0.0)

@@ -1,4 +1,4 @@
-"""From one mission's measurements to what it knows: map, hotspots, estimates, the nuclide."""
+"""From one mission's counts to what it knows: map, hotspots, estimate, the nuclide."""
 
 from dataclasses import replace
 
@@ -6,112 +6,124 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.estimation import (
-    Hotspots,
     Measurements,
-    RadiationMap,
     SourceFit,
-    aggregate,
     concatenate,
     extract_hotspots,
     initial_points,
     interpolate,
     localise,
 )
-from swarmsim.missions import keys
-from swarmsim.missions.measure import Accumulated, Log, accumulate_spectrum, count
-from swarmsim.missions.world import World
+from swarmsim.estimation.windows import Windows, measured
+from swarmsim.missions.plan import Plan
+from swarmsim.missions.state import Survey
 from swarmsim.pytree import pytree
-from swarmsim.radiation.detector import Detector
 from swarmsim.radiation.identify import Identification, identify
-
-AERIAL, GROUND = 0, 1  # index of the detector in the pair (UAV, rover)
-
-
-@pytree
-class AerialKnowledge:
-    """What the survey flight found."""
-
-    map: RadiationMap
-    hotspots: Hotspots
-    fit: SourceFit
-    found: jax.Array  # [] bool: there is a hotspot above the background
+from swarmsim.radiation.rate import spectrum_rate
+from swarmsim.radiation.detector import Detector, Source
+from swarmsim.site import Site, path_lengths
+from swarmsim.world import randomness
+from swarmsim.world.model import World
 
 
 @pytree
-class GroundKnowledge:
-    """What the rover's drive added."""
+class Accumulated:
+    """A spectrum summed over samples."""
 
-    spectrum: Accumulated
-    identification: Identification
+    counts: jax.Array  # [channels]
+    live_s: jax.Array  # []
+
+
+@pytree
+class Conclusion:
+    """What the mission found in the end."""
+
+    survey: Survey  # what sent the searchers out, or the map and estimate of all counts
+    spectrum: Accumulated | None  # None without an identification
+    identification: Identification | None
     nuclide: jax.Array  # [] int32: the identified one, or the presumed one where the confidence is too small
-    fit: SourceFit
+    fit: SourceFit  # from all counts
 
 
-def count_from_air(key: jax.Array, world: World, log: Log, first: jax.Array | int = 0) -> Measurements:
-    """The UAVs' measurements (axes [U, n]) along their logs [T, U], which begin with sample number ``first``."""
-    counts = keys.consumer(key, "aerial counts")
-    each = jax.tree.map(lambda x: jnp.moveaxis(x, 1, 0), log)
+def gathered(world: World, windows: tuple[Windows | None, ...]) -> Measurements:
+    """Counts of all groups after one another."""
+    return concatenate(
+        *(
+            measured(held, group.counter.index)
+            for group, held in zip(world.groups, windows, strict=True)
+            if held is not None and group.counter is not None
+        )
+    )
 
-    def one(index: jax.Array, detector: Detector, log: Log) -> Measurements:
-        return count(jax.random.fold_in(counts, index), world.site, detector, world.sources, log, 1, AERIAL, first)
 
-    return jax.vmap(one)(jnp.arange(world.team.home_m.shape[0]), world.team.detector, each)
+def survey(plan: Plan, measurements: Measurements) -> Survey:
+    """Interpolate the map, find hotspots, and fit a source to the counts.
 
-
-def count_on_ground(
-    key: jax.Array,
-    world: World,
-    log: Log,
-    ticks_per_sample: int,
-    first: jax.Array | int = 0,
-    live_s: float | None = None,
-) -> Measurements:
-    """The rover's measurements [n] along its log [T], which begins with sample number ``first``.
-
-    ``live_s`` replaces the detector's own sample period.
+    The map joins detectors of several models by their nominal backgrounds: the exposure of each is multiplied by its
+    background over that of the first model, as if all its counts grew with its size alike.
     """
-    assert world.rover is not None
-    counts = keys.consumer(key, "ground counts")
-    detector = world.rover.detector
-    if live_s is not None:
-        detector = replace(detector, sample_period_s=jnp.float32(live_s))
-    return count(counts, world.site, detector, world.sources, log, ticks_per_sample, GROUND, first)
+    assert plan.mapping is not None
+    assert plan.localisation is not None
+    background = jnp.stack([d.background_cps for d in plan.detectors])
+    size = jnp.where(background[0] > 0.0, background / jnp.maximum(background[0], 1e-9), 1.0)
+    scaled = replace(measurements, exposure_s=measurements.exposure_s * size[measurements.detector])
+    chart = interpolate(plan.mapping, scaled)
+    hotspots = extract_hotspots(plan.mapping, chart)
+    places = initial_points(plan.mapping, hotspots, plan.starts)
+    fit = localise(plan.site, plan.detectors, measurements, places, plan.presumed_nuclide, plan.localisation)
+    return Survey(map=chart, hotspots=hotspots, fit=fit, found=hotspots.valid[0])
 
 
-def detectors(world: World) -> tuple[Detector, ...]:
-    """The pair (UAV, rover) that `Measurements.detector` indexes; the rover's is left out where there is none."""
-    aerial = jax.tree.map(lambda leaf: leaf[0], world.team.detector)
-    return (aerial,) if world.rover is None else (aerial, world.rover.detector)
+def conclude(key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements) -> Conclusion:
+    """Identify the nuclide from the spectra near the source, and estimate the source from all counts.
+
+    ``world`` is asked for the spectra alone: they are drawn here, at the places of the measurements.
+    """
+    assert plan.localisation is not None
+    nuclide, spectrum, identification = plan.presumed_nuclide, None, None
+    if plan.spectrometer >= 0:
+        spectrum = _spectrum(key, world, plan, known, measurements)
+        identification = identify(plan.detectors[plan.spectrometer], spectrum.counts, spectrum.live_s)
+        sure = (identification.confidence >= plan.confidence_min) & (identification.nuclide >= 0)
+        nuclide = jnp.where(sure, identification.nuclide, plan.presumed_nuclide)
+    start = known.fit.position_m[None, :2]
+    fit = localise(plan.site, plan.detectors, measurements, start, nuclide, plan.localisation)
+    return Conclusion(survey=known, spectrum=spectrum, identification=identification, nuclide=nuclide, fit=fit)
 
 
-def windows(measurements: Measurements, per_window: int) -> Measurements:
-    """Measurements [U, n] summed over windows and put after one another."""
-    return concatenate(jax.vmap(lambda m: aggregate(m, per_window))(measurements))
+def _spectrum(key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements) -> Accumulated:
+    """The spectrum taken by the spectrometer within its radius of the estimate."""
+    apart = measurements.position_m[:, :2] - known.fit.position_m[:2]
+    near = jnp.sqrt(jnp.sum(apart * apart, axis=-1)) < plan.spectrum_radius_m
+    used = near & measurements.valid & (measurements.detector == plan.spectrometer)
+    counter = next(g.counter for g in world.groups if g.counter is not None and g.counter.index == plan.spectrometer)
+    return accumulate_spectrum(key, world.site, counter.detector, world.sources, measurements, used)
 
 
-def learn_from_air(world: World, measurements: Measurements, per_window: int, starts: int) -> AerialKnowledge:
-    """Interpolate the map, find hotspots, and fit a source to the counts."""
-    summed = windows(measurements, per_window)
-    chart = interpolate(world.mapping, summed)
-    hotspots = extract_hotspots(world.mapping, chart)
-    places = initial_points(world.mapping, hotspots, starts)
-    fit = localise(world.site, detectors(world)[:1], summed, places, world.presumed_nuclide, world.localisation)
-    return AerialKnowledge(map=chart, hotspots=hotspots, fit=fit, found=hotspots.valid[0])
+def accumulate_spectrum(
+    key: jax.Array, site: Site, detector: Detector, sources: Source, samples: Measurements, used: jax.Array
+) -> Accumulated:
+    """The spectrum taken during the samples that are ``used`` [n].
 
+    The sum of the samples' Poisson spectra is drawn at once, as a Poisson spectrum of the summed mean. The analyser has
+    its own draw: its total differs from the counter's by statistics, as it would with a dead time of its own.
+    """
+    # an idealised counter draws counts that stand for one second, whatever its period is
+    per_exposure = detector.sample_period_s if detector.kind == "paper_ideal" else jnp.ones(())
+    live = jnp.where(used, samples.exposure_s * per_exposure, 0.0)
 
-def learn_from_ground(
-    key: jax.Array, world: World, aerial: AerialKnowledge, air: Measurements, ground: Measurements, per_window: int
-) -> GroundKnowledge:
-    """Identify the nuclide from the spectrum near the source, and refine the estimate with all data."""
-    assert world.rover is not None
-    distance = jnp.linalg.norm(ground.position_m[:, :2] - aerial.fit.position_m[:2], axis=-1)
-    near = distance < world.rover.spectrum_radius_m
-    detector = world.rover.detector
-    spectrum = accumulate_spectrum(key, world.site, detector, world.sources, ground, near)
-    identification = identify(detector, spectrum.counts, spectrum.live_s)
-    sure = identification.confidence >= world.confidence_min
-    nuclide = jnp.where(sure & (identification.nuclide >= 0), identification.nuclide, world.presumed_nuclide)
-    everything = concatenate(windows(air, per_window), ground)
-    start = aerial.fit.position_m[None, :2]
-    fit = localise(world.site, detectors(world), everything, start, nuclide, world.localisation)
-    return GroundKnowledge(spectrum=spectrum, identification=identification, nuclide=nuclide, fit=fit)
+    def one(position: jax.Array, axis: jax.Array) -> jax.Array:
+        def of_source(source: Source) -> jax.Array:
+            return spectrum_rate(detector, source, path_lengths(site, source.position_m, position), position, axis)
+
+        return jnp.sum(jax.vmap(of_source)(sources), axis=0) + detector.background_spectrum
+
+    def add(total: jax.Array, sample: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        position, axis, live = sample
+        counted = jax.lax.cond(live > 0.0, lambda: live * one(position, axis), lambda: jnp.zeros_like(total))
+        return total + counted, None
+
+    start = jnp.zeros_like(detector.background_spectrum)
+    mean = jax.lax.scan(add, start, (samples.position_m, samples.axis, live))[0]
+    counts = jax.random.poisson(randomness.consumer(key, "spectrum"), mean).astype(jnp.float32)
+    return Accumulated(counts=counts, live_s=jnp.sum(live))

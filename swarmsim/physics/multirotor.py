@@ -6,7 +6,8 @@ Both take the same loads (rotors, drag, feet) and differ in who integrates the b
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from functools import cache
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +18,10 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import Multirotor
 from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench
 from swarmsim.physics.mjx_import import mjx
-from swarmsim.physics.rigid_body import free_body_step, rotation_matrix, to_body, to_world
-from swarmsim.physics.rotations import from_yaw, multiply
+from swarmsim.physics.rigid_body import free_body_step
+from swarmsim.physics.rotations import from_yaw, multiply, rotation_matrix, to_body, to_world
 from swarmsim.pytree import pytree
-from swarmsim.vehicles.multirotor import MultirotorParams, battery_power, multirotor_mjcf, rotor_speeds, wrench
+from swarmsim.vehicles.multirotor import MultirotorParams, battery_power, free_body_mjcf, rotor_speeds, wrench
 from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
 
 Engine = Literal["mjx", "analytic"]
@@ -40,25 +41,19 @@ class Loads:
     power_w: jax.Array  # [] W from the battery
 
 
-def make_multirotor_step(spec: Multirotor, engine: Engine, dt: float) -> Step:
+def make_multirotor_step(engine: Engine, dt: float) -> Step:
     """The function ``step(params, state, rotor_command_rad_s [R], wind_m_s [3] world, ground) -> state`` over ``dt`` s.
 
-    ``spec`` gives the number of rotors and feet; everything else of it comes from ``params``, so that masses, drags and
-    the like are swept without compiling anew. A command at or below zero disarms its rotor. The step is pure, of one
-    vehicle, and has no loop that a non-finite input could keep alive.
+    Everything about the vehicle comes from ``params``, so that masses, drags and the like are swept without compiling
+    anew. A command at or below zero disarms its rotor. The step is pure, of one vehicle, and has no loop that a
+    non-finite input could keep alive.
 
-    Raises `InputError` for an unknown engine, or where ``dt`` is too long for the feet.
+    Raises `InputError` for an unknown engine.
     """
     engines = {"mjx": _mjx_body, "analytic": _analytic_body}
     if engine not in engines:
         raise InputError.of(f"there is no engine '{engine}': choose one of {', '.join(engines)}")
-    longest = longest_time_step(spec)
-    if dt > longest:
-        raise InputError.of(
-            f"a time step of {dt} s is too long for the feet of {spec.name}: use {longest:.4f} s or less, "
-            "or softer feet (feet.stiffness_n_m, feet.damping_n_s_m)"
-        )
-    integrate = engines[engine](spec, dt)
+    integrate = engines[engine](dt)
 
     def step(
         params: MultirotorParams,
@@ -77,6 +72,16 @@ def make_multirotor_step(spec: Multirotor, engine: Engine, dt: float) -> Step:
         )
 
     return step
+
+
+def check_time_step(spec: Multirotor, dt: float) -> None:
+    """Raise `InputError` where ``dt`` is too long for the feet of ``spec``."""
+    longest = longest_time_step(spec)
+    if dt > longest:
+        raise InputError.of(
+            f"a time step of {dt} s is too long for the feet of {spec.name}: use {longest:.4f} s or less, "
+            "or softer feet (feet.stiffness_n_m, feet.damping_n_s_m)"
+        )
 
 
 def step_loads(
@@ -179,7 +184,7 @@ def longest_time_step(spec: Multirotor) -> float:
     return float((-c + np.sqrt(c * c + 2.0 * k)) / k)  # k dt^2 + 2 c dt = 2
 
 
-def _analytic_body(spec: Multirotor, dt: float) -> Integrate:
+def _analytic_body(dt: float) -> Integrate:
     def integrate(params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array) -> RigidState:
         return free_body_step(
             body,
@@ -193,9 +198,16 @@ def _analytic_body(spec: Multirotor, dt: float) -> Integrate:
     return integrate
 
 
-def _mjx_body(spec: Multirotor, dt: float) -> Integrate:
-    compiled = mujoco.MjModel.from_xml_string(multirotor_mjcf(spec, dt, visual=False))
-    model, template = mjx.put_model(compiled), mjx.make_data(compiled)  # constants of the compiled step
+@cache
+def _free_body(dt: float) -> tuple[Any, Any]:
+    """MJX's model and data of one free body of unit mass and inertia, which the step replaces."""
+    compiled = mujoco.MjModel.from_xml_string(free_body_mjcf("body", 1.0, (1.0, 1.0, 1.0), dt))
+    with jax.ensure_compile_time_eval():  # the cached arrays must not be tracers of the program that asks first
+        return mjx.put_model(compiled), mjx.make_data(compiled)
+
+
+def _mjx_body(dt: float) -> Integrate:
+    model, template = _free_body(dt)  # constants of the compiled step
 
     def integrate(params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array) -> RigidState:
         swept = replace(

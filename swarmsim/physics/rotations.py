@@ -1,19 +1,44 @@
-"""Unit quaternions (w x y z, body to world) and the vectors they turn."""
+"""Attitudes: unit quaternions (w x y z, body to world) and rotation matrices."""
 
 import jax
 import jax.numpy as jnp
 
 
 def rotate(q: jax.Array, v: jax.Array) -> jax.Array:
-    """Turn body vector ``v`` [..., 3] into the world frame by ``q`` [..., 4]."""
+    """Body vector ``v`` [..., 3] in the world frame; ``q`` [..., 4]."""
     w, u = q[..., :1], q[..., 1:]
     t = 2.0 * jnp.cross(u, v)
     return v + w * t + jnp.cross(u, t)
 
 
 def rotate_inverse(q: jax.Array, v: jax.Array) -> jax.Array:
-    """Turn world vector ``v`` [..., 3] into the body frame of ``q`` [..., 4]."""
+    """World vector ``v`` [..., 3] in the body frame; ``q`` [..., 4]."""
     return rotate(conjugate(q), v)
+
+
+def rotation_matrix(q: jax.Array) -> jax.Array:
+    """Matrix [3, 3], body to world, of the unit quaternion ``q`` [4]."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return jnp.stack(
+        [
+            jnp.stack([1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)]),
+            jnp.stack([2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)]),
+            jnp.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)]),
+        ]
+    )
+
+
+def to_world(matrix: jax.Array, v: jax.Array) -> jax.Array:
+    """Body vectors ``v`` [..., 3] in the world frame of the attitude ``matrix`` [3, 3].
+
+    A sum, because a dot product of this size would be a kernel of its own.
+    """
+    return jnp.sum(matrix * v[..., None, :], axis=-1)
+
+
+def to_body(matrix: jax.Array, v: jax.Array) -> jax.Array:
+    """World vectors ``v`` [..., 3] in the body frame of the attitude ``matrix`` [3, 3]."""
+    return jnp.sum(matrix * v[..., :, None], axis=-2)
 
 
 def conjugate(q: jax.Array) -> jax.Array:
@@ -22,7 +47,7 @@ def conjugate(q: jax.Array) -> jax.Array:
 
 
 def multiply(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Hamilton product a b: first turn by ``b``, then by ``a`` [..., 4]."""
+    """Hamilton product a b [..., 4]: the rotation ``b`` followed by ``a``."""
     aw, av = a[..., :1], a[..., 1:]
     bw, bv = b[..., :1], b[..., 1:]
     w = aw * bw - jnp.sum(av * bv, axis=-1, keepdims=True)

@@ -1,8 +1,8 @@
-"""Closed form of a skid-steer rover that follows the terrain, for the largest sweeps: no contact solver.
+"""Closed-form model of a skid-steer rover that follows the terrain, without a contact solver, for the largest sweeps.
 
-Three motions are stepped apart, each with its Coulomb friction taken implicitly, so that it is stable at any step and
-comes to a true rest: along the wheels (traction up to friction x load, rolling resistance), turning (effective track
-and turning resistance of `swarmsim.vehicles.skid_steer`), and sideways (slides when pushed harder than friction holds).
+Three motions are integrated separately: along the wheels (traction up to friction x load, rolling resistance), turning
+(effective track and turning resistance of `swarmsim.vehicles.skid_steer`) and sideways (slides when the side force
+exceeds friction). Coulomb friction is implicit in each, so any step size is stable and the rover comes to rest exactly.
 Height and attitude are those of the plane through the ground below the four wheels.
 """
 
@@ -10,37 +10,44 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.physics import wheels
-from swarmsim.physics.rotations import yaw_of
+from swarmsim.physics.rotations import rotation_matrix, to_body, to_world, yaw_of
 from swarmsim.site import Site, sample
-from swarmsim.vehicles.skid_steer import SkidSteerParams, effective_track, turning_force, wheel_spacing
+from swarmsim.vehicles.skid_steer import (
+    SkidSteerParams,
+    effective_track,
+    turning_force,
+    tyre_creep,
+    tyre_sinkage,
+    wheel_spacing,
+)
 from swarmsim.vehicles.state import RigidState, SkidSteerState
 
 
 def analytic_step(
     dt: float, params: SkidSteerParams, state: SkidSteerState, command_rad_s: jax.Array, site: Site
 ) -> SkidSteerState:
-    """One step of ``dt`` seconds; signature and state as those of the ``mjx`` engine."""
+    """One step of ``dt`` seconds; same signature and state as the ``mjx`` engine."""
     body = state.body
-    rotation = wheels.rotation_matrix(body.quaternion)
+    rotation = rotation_matrix(body.quaternion)
     torque = wheels.motor_torque(params, state, command_rad_s, dt)
     push, turn = wheels.bumper_wrench(params, state, rotation, site)
-    pushed = jnp.append(push, -params.mass_kg * params.gravity_m_s2) @ rotation
+    pushed = to_body(rotation, jnp.append(push, -params.mass_kg * params.gravity_m_s2))
     load = jnp.maximum(-pushed[2], 0.0)
-    speed, side, _ = body.velocity_m_s @ rotation
+    speed, side, _ = to_body(rotation, body.velocity_m_s)
     speed, wheel_mean = _roll(dt, params, speed, state.wheel_speed_rad_s, torque, pushed[0], load)
     hold = dt * params.friction * load / params.mass_kg
-    side = _coulomb(side + dt * pushed[1] / params.mass_kg, hold, params.tyre_creep_m_s)
+    side = _coulomb(side + dt * pushed[1] / params.mass_kg, hold, tyre_creep(params))
     wheel_half_difference, yaw_rate = _turn(dt, params, state.wheel_speed_rad_s, torque, turn, load)
-    velocity = rotation @ jnp.stack([speed, side, jnp.zeros(())])
+    velocity = to_world(rotation, jnp.stack([speed, side, jnp.zeros(())]))
     yaw = yaw_of(body.quaternion) + dt * yaw_rate
     position, quaternion = _stand(params, site, body.position_m[:2] + dt * velocity[:2], yaw)
-    turned = wheels.rotation_matrix(quaternion)
+    turned = rotation_matrix(quaternion)
     wheel_speed = wheel_mean + wheel_half_difference * jnp.array([-1.0, 1.0, -1.0, 1.0])
     return SkidSteerState(
         body=RigidState(
             position_m=position,
             quaternion=quaternion,
-            velocity_m_s=turned @ jnp.stack([speed, side, jnp.zeros(())]),
+            velocity_m_s=to_world(turned, jnp.stack([speed, side, jnp.zeros(())])),
             angular_velocity_rad_s=yaw_rate * turned[2],
         ),
         wheel_angle_rad=state.wheel_angle_rad + dt * wheel_speed,
@@ -51,7 +58,7 @@ def analytic_step(
 
 
 def _coulomb(speed: jax.Array, most: jax.Array, onset: jax.Array | float = 0.0) -> jax.Array:
-    """``speed`` [] after dry friction that can take ``most`` [] (same unit) off it within the step.
+    """``speed`` [] after Coulomb friction, which changes it by at most ``most`` [] (same unit) in the step.
 
     Below the speed ``onset`` [] the friction is proportional to the speed at the end of the step.
     """
@@ -59,13 +66,13 @@ def _coulomb(speed: jax.Array, most: jax.Array, onset: jax.Array | float = 0.0) 
 
 
 def _wheels_mass(params: SkidSteerParams) -> jax.Array:
-    """Inertia of the four wheels with their motors as a mass [] (kg) that moves at the tyres' speed."""
+    """Inertia of the four wheels with their motors as an equivalent mass [] (kg) at the speed of the treads."""
     return 4.0 * (params.wheel_inertia_kg_m2 + params.rotor_inertia_kg_m2) / _rolling_radius(params) ** 2
 
 
 def _rolling_radius(params: SkidSteerParams) -> jax.Array:
-    """Radius [] (m) at which a sunk tyre touches, as MuJoCo has it: halfway between tyre and ground."""
-    return params.wheel_radius_m - 0.5 * params.tyre_sinkage_m
+    """Rolling radius [] (m) of a loaded tyre: as in MuJoCo, the contact is halfway between tyre and ground."""
+    return params.wheel_radius_m - 0.5 * tyre_sinkage(params)
 
 
 def _roll(
@@ -79,7 +86,7 @@ def _roll(
 ) -> tuple[jax.Array, jax.Array]:
     """Speed of the rover ahead [] (m/s) and mean wheel speed [] (rad/s) after the step.
 
-    The traction is what makes the tyres' speed that of the rover at the end of the step, no more than the ground holds.
+    The traction makes tyre and rover equally fast at the end of the step, up to the limit of friction.
     """
     mass, wheels_mass, radius = params.mass_kg, _wheels_mass(params), _rolling_radius(params)
     tyre_free = jnp.mean(wheel_speed) * radius + dt * jnp.sum(torque) / radius / wheels_mass
@@ -107,7 +114,7 @@ def _turn(
     free = 0.25 * jnp.sum(side * wheel_speed) * radius + dt * force / inertia
     base, track = wheel_spacing(params.wheel_position_m)
     # Slip of a tyre over the tread's speed while turning: half the diagonal times b / B, and the yaw rate.
-    onset = params.tyre_creep_m_s * lever * 2.0 * track / base * jax.lax.rsqrt(base * base + track * track)
+    onset = tyre_creep(params) * lever * 2.0 * track / base * jax.lax.rsqrt(base * base + track * track)
     tread = _coulomb(free, dt * turning_force(params, load) / inertia, onset)
     return tread / radius, tread / lever
 
@@ -121,5 +128,5 @@ def _stand(params: SkidSteerParams, site: Site, xy: jax.Array, yaw: jax.Array) -
     climb = 0.5 * jnp.sum(height * jnp.array([1.0, 1.0, -1.0, -1.0])) / base
     bank = 0.5 * jnp.sum(height * jnp.array([1.0, -1.0, 1.0, -1.0])) / track
     ground = jnp.mean(height) - climb * jnp.mean(x) - bank * jnp.mean(y)
-    rise = params.wheel_radius_m - params.tyre_sinkage_m - jnp.mean(params.wheel_position_m[:, 2])
+    rise = params.wheel_radius_m - tyre_sinkage(params) - jnp.mean(params.wheel_position_m[:, 2])
     return jnp.append(xy, ground + rise * jnp.sqrt(1.0 + climb**2 + bank**2)), wheels.attitude(climb, bank, yaw)

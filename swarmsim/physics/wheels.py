@@ -1,22 +1,14 @@
-"""What acts on a skid-steer rover besides its tyres' contact: motors, ground below the wheels, walls, battery."""
+"""Loads of a skid-steer rover other than tyre contact: motors, rolling resistance, walls; ground planes; battery."""
 
 import jax
 import jax.numpy as jnp
 
+from swarmsim.physics.rotations import rotation_matrix
 from swarmsim.site import Site, sample_with_gradient
 from swarmsim.vehicles.skid_steer import SkidSteerParams
 from swarmsim.vehicles.state import SkidSteerState
 
-ROLLING_ONSET_RAD_S = 0.1  # wheel speed at which the regularised rolling resistance has 76 % of its size
-
-
-def rotation_matrix(q: jax.Array) -> jax.Array:
-    """Matrix [3, 3] of the unit quaternion ``q`` [4]: body to world."""
-    w, x, y, z = q
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return jnp.stack(rows).reshape(3, 3)
+ROLLING_ONSET_RAD_S = 0.1  # wheel speed at which the regularised rolling resistance reaches 76 %
 
 
 def motor_torque(params: SkidSteerParams, state: SkidSteerState, command_rad_s: jax.Array, dt: float) -> jax.Array:
@@ -41,7 +33,7 @@ def energy_used(params: SkidSteerParams, state: SkidSteerState, torque_nm: jax.A
 
 
 def ground_planes(site: Site, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Tangent planes of the terrain at ``xy`` [n, 2]: heights [n] (m) and unit normals [n, 3], world."""
+    """Tangent planes of the terrain at ``xy`` [n, 2] (m, world): heights [n] (m) and unit normals [n, 3], world."""
     height, slope = sample_with_gradient(site.terrain_m, site, xy)
     up = jax.lax.rsqrt(1.0 + jnp.sum(slope * slope, axis=-1, keepdims=True))
     return height, jnp.concatenate([-slope * up, up], axis=-1)
@@ -50,15 +42,16 @@ def ground_planes(site: Site, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
 def wall_contact(
     params: SkidSteerParams, state: SkidSteerState, rotation: jax.Array, site: Site
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Where the outline's corners stand towards walls.
+    """Contact of the outline's corners with walls.
 
-    Returns the depth [4] (m, > 0 in the wall), the way out of the wall [4, 2] (unit, world), the speed into the wall
-    [4] (m/s) and the corners' arms from the centre of mass [4, 2] (m, world). ``rotation`` [3, 3]: body to world.
+    Returns the depth [4] (m, > 0 in the wall), the direction out of the wall [4, 2] (unit, world), the speed into the
+    wall [4] (m/s) and the corners' positions from the centre of mass [4, 2] (m, world). ``rotation`` [3, 3]: body to
+    world.
     """
-    arm = params.corner_m @ rotation[:2, :2].T
+    arm = jnp.sum(rotation[:2, :2] * params.corner_m[:, None, :], axis=-1)
     clearance, gradient = sample_with_gradient(site.clearance_m, site, state.body.position_m[:2] + arm)
     outward = gradient * jax.lax.rsqrt(jnp.sum(gradient * gradient, axis=-1, keepdims=True) + 1e-12)
-    spin = rotation[2] @ state.body.angular_velocity_rad_s
+    spin = jnp.sum(rotation[2] * state.body.angular_velocity_rad_s)
     velocity = state.body.velocity_m_s[:2] + spin * jnp.stack([-arm[:, 1], arm[:, 0]], axis=-1)
     return -clearance, outward, -jnp.sum(velocity * outward, axis=-1), arm
 
@@ -69,7 +62,7 @@ def bumper_wrench(
     """Force [2] (N, world x and y) and moment [] (N m, about the vertical) of the walls on the rover.
 
     A spring-damper at each corner pushes along the gradient of the clearance, without friction. It acts at the height
-    of the centre of mass, so that a wall stops the rover and neither lifts nor tips it.
+    of the centre of mass, so a wall neither lifts nor tips the rover.
     """
     depth, outward, approach, arm = wall_contact(params, state, rotation, site)
     push = params.bumper_stiffness_n_m * depth + params.bumper_damping_n_s_m * approach
@@ -78,7 +71,7 @@ def bumper_wrench(
 
 
 def impact_speed(params: SkidSteerParams, state: SkidSteerState, site: Site) -> jax.Array:
-    """Speed [] (m/s) at which a corner that touches a wall moves into it; 0 when none does.
+    """Largest speed [] (m/s) of a corner into the wall that it touches; 0 without contact.
 
     A value above ``params.impact_speed_max_m_s`` is a collision.
     """
@@ -93,7 +86,9 @@ def stand_on(slope: jax.Array, yaw: jax.Array) -> jax.Array:
 
 
 def attitude(climb: jax.Array, bank: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Quaternion [4] of a body on ground that rises by ``climb`` [] per metre ahead and ``bank`` [] to the left."""
+    """Quaternion [4] of a body with heading ``yaw`` [] (rad) on ground that rises by ``climb`` [] per metre ahead and
+    ``bank`` [] per metre to the left.
+    """
     pitch = -jnp.arctan(climb)
     roll = jnp.arctan(bank * jnp.cos(pitch))
     half = 0.5 * jnp.stack([yaw, pitch, roll])

@@ -6,19 +6,14 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from swarmsim.missions.record import MissionRecord
+from swarmsim.playback.colours import DRIVEN, measured_phases
+from swarmsim.playback.entities import TIMELINE, measurements_path, measurers, path_of, trails
+from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 
-TIMELINE = "sim_time"
-# Vehicles are drawn larger than life, or nobody would find them on a site of 150 m.
-BODY_SCALE = {"multirotor": 5.0, "skid_steer": 3.0}
 _BACKGROUND = [30, 33, 39]
 _PLAYBACK_SPEED = 10.0
-
-
-def path_of(parent: str, name: str) -> str:
-    """Entity path of ``name`` below ``parent``, whatever characters it holds."""
-    return f"{parent}/{rr.escape_entity_path_part(name)}"
+_PLOTS_ABREAST = 2  # count rates of more phases than these share one place
 
 
 def site_bounds(site_model: SiteModel) -> tuple[np.ndarray, np.ndarray]:
@@ -30,10 +25,12 @@ def site_bounds(site_model: SiteModel) -> tuple[np.ndarray, np.ndarray]:
 def blueprint(record: MissionRecord, site_model: SiteModel) -> rrb.Blueprint:
     """The layout that is stored with the recording."""
     low, high = site_bounds(site_model)
+    spectrum = [_spectrum(record)] if record.sought == "nuclide" else []
+    right = rrb.Vertical(_map(record, low, high), *spectrum, _texts(), row_shares=[1.45, *(1.0 for _ in spectrum), 1.0])
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(_scene(record, low, high), _plots(record), row_shares=[2.8, 1.0]),
-            rrb.Vertical(_map(record, low, high), _spectrum(record), _texts(), row_shares=[1.45, 1.0, 1.0]),
+            right,
             column_shares=[2.1, 1.0],
         ),
         rrb.TimePanel(
@@ -55,8 +52,10 @@ def _growing(record: MissionRecord) -> dict[Any, rrb.VisibleTimeRanges]:
     so_far = rrb.VisibleTimeRanges(
         timeline=TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
     )
-    parents = ("world/trails", "world/measurements/aerial", "world/measurements/ground")
-    return {path_of(parent, v.name): so_far for parent in parents for v in record.vehicles}
+    paths = [path_of("world/trails", name) for name in trails(record)]
+    for phase in measured_phases(record):
+        paths += [path_of(measurements_path(phase.name), name) for name in measurers(record, phase)]
+    return dict.fromkeys(paths, so_far)
 
 
 def _scene(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatial3DView:
@@ -80,14 +79,16 @@ def _scene(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spat
 
 
 def _map(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatial3DView:
-    """The scene from straight above, north up, without the flown points that would hide the map."""
+    """The scene from straight above, north up, without the points measured in flight, which would hide the map."""
     centre, size = 0.5 * (low + high), high - low
     target = centre - [0.0, 0.04 * size[1], 0.0]  # room for the legend along the south edge
     eye = target + np.array([0.0, 0.0, 1.2 * max(size[1], 0.7 * size[0])])
+    flown = [phase.name for phase in measured_phases(record) if record.map is not None and record.is_flown(phase)]
+    hidden = ["world/labels", f"world/legend/{DRIVEN}", *map(measurements_path, flown)]
     return rrb.Spatial3DView(
-        name="Map (north up)",
+        name="Map (north up)" if record.map is not None else "From above (north up)",
         origin="world",
-        contents=["+ world/**", "- world/measurements/aerial/**", "- world/labels/**", "- world/legend/ground/**"],
+        contents=["+ world/**", *(f"- {path}/**" for path in hidden)],
         background=rrb.Background(color=_BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
@@ -98,14 +99,13 @@ def _map(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatia
 
 
 def _plots(record: MissionRecord) -> rrb.Container:
-    """Count rates and batteries against the time of the phase that they belong to."""
-    whole = (min(p.start_s for p in record.phases), record.end_s)
+    """Count rates against the time of their phase; batteries and heights against that of the mission."""
+    whole = (record.start_s, record.end_s)
 
     def plot(
-        origin: str, name: str, span: tuple[float, float] | None, legend: rrb.Corner2D = rrb.Corner2D.LeftTop
+        origin: str, name: str, span: tuple[float, float], legend: rrb.Corner2D = rrb.Corner2D.LeftTop
     ) -> rrb.TimeSeriesView:
-        shown = span if span is not None and span[1] > span[0] else whole
-        start, end = (rrb.TimeRangeBoundary.absolute(seconds=s) for s in shown)
+        start, end = (rrb.TimeRangeBoundary.absolute(seconds=s) for s in (span if span[1] > span[0] else whole))
         return rrb.TimeSeriesView(
             origin=origin,
             name=name,
@@ -113,18 +113,22 @@ def _plots(record: MissionRecord) -> rrb.Container:
             plot_legend=rrb.PlotLegend(corner=legend),
         )
 
-    return rrb.Horizontal(
-        plot("plots/aerial_rate", "Count rate, air [1/s]", record.span("aerial")),
-        plot("plots/ground_rate", "Count rate, ground [1/s]", record.span("ground")),
-        rrb.Tabs(
-            plot("plots/battery", "Battery [%]", whole, rrb.Corner2D.LeftBottom),  # full ones start in the left top
-            plot("plots/height", "Height above ground [m]", whole, rrb.Corner2D.RightTop),
-        ),
-    )
+    rates = [
+        plot(path_of("plots/rate", phase.name), f"Count rate, {phase.name} [1/s]", (phase.start_s, phase.end_s))
+        for phase in measured_phases(record)
+    ]
+    states = [
+        plot("plots/battery", "Battery [%]", whole, rrb.Corner2D.LeftBottom),  # full ones start in the left top
+        plot("plots/height", "Height above ground [m]", whole, rrb.Corner2D.RightTop),
+    ]
+    if not rates:
+        return rrb.Horizontal(*states)
+    abreast = rates if len(rates) <= _PLOTS_ABREAST else [rrb.Tabs(*rates)]
+    return rrb.Horizontal(*abreast, rrb.Tabs(*states))
 
 
 def _spectrum(record: MissionRecord) -> rrb.View:
-    """Bars of the spectrum; a mission without one says so instead of showing empty axes."""
+    """Bars of the spectrum; a sentence where there is none."""
     if record.spectrum is None:
         return rrb.TextDocumentView(origin="spectrum", name="Spectrum")
     return rrb.BarChartView(

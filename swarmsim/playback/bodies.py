@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmsim.missions.record import Shape, VehicleRecord
 from swarmsim.playback.colours import rgba
+from swarmsim.results.record import Shape, VehicleRecord
 
 # Sizes of a vehicle of which nothing but the kind is known: a small quadrotor, a small four-wheeled rover.
 _GENERIC = {

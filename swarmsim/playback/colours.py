@@ -1,4 +1,4 @@
-"""Colours of everything that is drawn: vehicles, count rates, marks of sources. Safe for colour-blind readers."""
+"""Colours of everything that is drawn: vehicles, count rates, marks of sources; safe for colour-blind readers."""
 
 from dataclasses import dataclass
 
@@ -7,25 +7,25 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
-from swarmsim.missions.record import MissionRecord, Samples
+from swarmsim.results.record import MissionRecord, Phase, Samples
 
 # Okabe & Ito (2008), "Color universal design", without its black and its yellow (too pale on paper).
-_TEAM = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
-GROUND_VEHICLE = "#D55E00"
+_FLYING = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
+_DRIVING = ("#D55E00", "#8A3700", "#F2A36B")  # its vermilion, darker and lighter
 TRUTH = "#D55E00"
 ESTIMATE = "#0072B2"
 RATE_MAP = "viridis"
+FLOWN, DRIVEN = "flown", "driven"
+"""Colour scales of count rates, by how the phase moves that they were measured in."""
 
 
 def vehicle_colours(record: MissionRecord) -> list[str]:
-    """A colour (hex) for each vehicle: rovers vermilion, multirotors in turn through the rest of the palette."""
-    colours, flying = [], 0
+    """A colour (hex) for each vehicle: rovers and multirotors each cycle through colours of their own."""
+    colours, used = [], {True: 0, False: 0}
     for vehicle in record.vehicles:
-        if vehicle.kind == "multirotor":
-            colours.append(_TEAM[flying % len(_TEAM)])
-            flying += 1
-        else:
-            colours.append(GROUND_VEHICLE)
+        palette = _FLYING if vehicle.flies else _DRIVING
+        colours.append(palette[used[vehicle.flies] % len(palette)])
+        used[vehicle.flies] += 1
     return colours
 
 
@@ -82,3 +82,29 @@ def smoothed_rate(samples: Samples, window_s: float = 1.0) -> NDArray[np.floatin
         exposure = np.r_[0.0, np.cumsum(samples.exposure_s[mine], dtype=float)]
         rate[mine] = (counts[last] - counts[first]) / np.maximum(exposure[last] - exposure[first], 1e-9)
     return rate
+
+
+def measured_phases(record: MissionRecord) -> list[Phase]:
+    """The phases in which something was measured."""
+    measured = set(record.samples.phase.tolist())
+    return [phase for phase in record.phases if phase.name in measured]
+
+
+def scale_name(record: MissionRecord, phase: Phase) -> str:
+    """Which colour scale the count rates of a phase have: `FLOWN` or `DRIVEN`."""
+    return FLOWN if record.is_flown(phase) else DRIVEN
+
+
+def rate_scales(record: MissionRecord) -> dict[str, RateScale]:
+    """The colour scales of a mission: linear for what was measured in flight and for the map, which share theirs.
+
+    What rovers measured has a logarithmic one, since count rates rise steeply near a source. A mission without a map
+    that measured nothing has none.
+    """
+    rates: dict[str, list[NDArray[np.floating]]] = {FLOWN: [], DRIVEN: []}
+    if record.map is not None:
+        rates[FLOWN].append(record.map.mean_cps.reshape(-1))
+    for phase in measured_phases(record):
+        rates[scale_name(record, phase)].append(smoothed_rate(record.samples.of_phase(phase.name)))
+    made = {FLOWN: linear_scale, DRIVEN: log_scale}
+    return {name: made[name](np.concatenate(values)) for name, values in rates.items() if values}

@@ -1,8 +1,12 @@
-"""The figures of a mission for print: trajectories, aerial counts, the map, ground counts, the spectrum.
+"""The figures of a mission for print: trajectories, measurements of each phase, the map, the spectrum.
 
-They are the counterparts of Figures 6 to 9 of the reconnaissance paper, with the spectrum as the tenth.
+A figure that would be empty is left out.
 """
 
+import re
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,23 +20,25 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
-from swarmsim.missions.record import Estimate, MissionRecord, RadiationMap
 from swarmsim.playback import plan
-from swarmsim.playback.colours import RATE_MAP, linear_scale, log_scale, smoothed_rate, vehicle_colours
+from swarmsim.playback.colours import RATE_MAP, linear_scale, log_scale, measured_phases, smoothed_rate, vehicle_colours
+from swarmsim.playback.entities import is_large
 from swarmsim.playback.spectrum_figure import spectrum_figure
+from swarmsim.results.record import Estimate, MissionRecord, Phase, RadiationMap
 from swarmsim.site.model import SiteModel
 
 _RATE_LABEL = "Count rate, 1 s mean [1/s]"
-_TRACK_POINTS_MAX = 4000
+_TRACK_POINTS_MAX = 50_000  # of all vehicles
+_TRACK_COLUMNS = 3  # of the legend
 
 
 def write(record: MissionRecord, site_model: SiteModel, folder: Path) -> list[Path]:
-    """Write the five figures as PNG and as PDF into ``folder`` (made if needed); returns the paths of the PNG files."""
+    """Write the figures as PNG and as PDF into ``folder`` (made if needed); returns the paths of the PNG files."""
     folder.mkdir(parents=True, exist_ok=True)
     record = record.finite()
     written = []
     with plan.print_style():
-        for name, make in FIGURES.items():
+        for name, make in figures_of(record).items():
             figure = make(record, site_model)
             path = folder / f"{name}.png"
             figure.savefig(path, dpi=plan.DPI)
@@ -41,29 +47,51 @@ def write(record: MissionRecord, site_model: SiteModel, folder: Path) -> list[Pa
     return written
 
 
+def figures_of(record: MissionRecord) -> dict[str, Callable[[MissionRecord, SiteModel], Figure]]:
+    """The figures that a mission has something to show on, by the names of their files."""
+    made: dict[str, Callable[[MissionRecord, SiteModel], Figure]] = {"trajectories": trajectories}
+    for phase in measured_phases(record):
+        make = flown_measurements if record.is_flown(phase) else driven_measurements
+        made[f"measurements_{re.sub('[^A-Za-z0-9_.-]', '_', phase.name)}"] = partial(make, phase)
+    if record.map is not None:
+        made["radiation_map"] = radiation_map
+    if record.spectrum is not None:
+        made["spectrum"] = spectrum
+    return made
+
+
 def trajectories(record: MissionRecord, site_model: SiteModel) -> Figure:
-    """Paths of all vehicles over the site plan."""
-    figure, axes = plan.new_plan(site_model, legend_height_in=0.62)
+    """Paths of all vehicles over the site plan; a large team is named by its types."""
+    large = is_large(record)
+    entries = 3 + (len({v.type for v in record.vehicles}) if large else len(record.vehicles))
+    figure, axes = plan.new_plan(site_model, legend_height_in=0.2 + 0.14 * -(-entries // _TRACK_COLUMNS))
+    points = max(2, _TRACK_POINTS_MAX // max(1, len(record.vehicles)))
+    width = 0.4 if large else 0.9
     for vehicle, colour in zip(record.vehicles, vehicle_colours(record), strict=True):
-        x, y, _ = vehicle.position_m[:: max(1, len(vehicle.time_s) // _TRACK_POINTS_MAX)].T
-        line = "-" if vehicle.kind == "multirotor" else "--"
-        axes.plot(x, y, line, color=colour, label=vehicle.name, zorder=4)
+        x, y, _ = vehicle.position_m[:: max(1, len(vehicle.time_s) // points)].T
+        line = "-" if vehicle.flies else "--"
+        name = "_" if large else vehicle.name
+        axes.plot(x, y, line, color=colour, label=name, linewidth=width, zorder=4)
         axes.plot(
-            x[:1], y[:1], "s", color=colour, markersize=3.0, markeredgecolor="black", markeredgewidth=0.4, zorder=6
-        )
+            x[:1], y[:1], "s", color=colour, markersize=3.0 * width, markeredgecolor="black", markeredgewidth=0.4,
+            zorder=6,
+        )  # fmt: skip
     plan.draw_truth(axes, record)
     handles, _ = axes.get_legend_handles_labels()
+    if large:
+        counts = Counter(vehicle.type for vehicle in record.vehicles)
+        handles += [Line2D([], [], color="0.3", label=f"{count} {kind}") for kind, count in counts.items()]
     start = Line2D(
         [], [], linestyle="none", marker="s", color="0.8", markeredgecolor="black", markersize=3.0, label="start"
     )
-    plan.legend_above(axes, 3, [*handles, start, plan.building_patch()])
+    plan.legend_above(axes, _TRACK_COLUMNS, [*handles, start, plan.building_patch()])
     return figure
 
 
-def aerial_measurements(record: MissionRecord, site_model: SiteModel) -> Figure:
-    """Count rates measured from the air, where they were measured."""
+def flown_measurements(phase: Phase, record: MissionRecord, site_model: SiteModel) -> Figure:
+    """Count rates of a phase that was flown, where they were measured."""
     figure, axes = plan.new_plan(site_model)
-    samples = record.samples.of_phase("aerial")
+    samples = record.samples.of_phase(phase.name)
     rate = smoothed_rate(samples)
     scale = linear_scale(rate)
     x, y, _ = samples.position_m.T
@@ -76,9 +104,10 @@ def aerial_measurements(record: MissionRecord, site_model: SiteModel) -> Figure:
 
 
 def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
-    """The interpolated map with contours, hotspots, truth and the estimate made from the air; whole and close up."""
+    """The interpolated map with contours, hotspots, truth and the estimate made with it; whole and close up."""
     made = record.map
-    centre, half = _close_up(record.aerial_estimate, made.hotspots_m, site_model)
+    assert made is not None
+    centre, half = _close_up(record.survey_estimate, made.hotspots_m, site_model)
     figure, whole, close = plan.new_pair(site_model, centre, half)
     for axes in (whole, close):
         image = _draw_map(axes, made)
@@ -87,7 +116,7 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
             axes.plot(*made.hotspots_m.T, linestyle="none", marker="o", markersize=9.0, markerfacecolor="none",
                       markeredgecolor="black", markeredgewidth=1.0, label="hotspot", zorder=6)  # fmt: skip
         plan.draw_truth(axes, record)
-        plan.draw_estimate(axes, record.aerial_estimate, "estimate from the air, 95 % ellipse")
+        plan.draw_estimate(axes, record.survey_estimate, "survey estimate, 95 % ellipse")
     plan.colour_bar(figure, close, image, "Count rate, interpolated [1/s]")
     handles, _ = whole.get_legend_handles_labels()
     plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="obstacles")])
@@ -125,22 +154,22 @@ def _outline_buildings(axes: Axes, site_model: SiteModel) -> None:
     outline.set_path_effects([withStroke(linewidth=1.3, foreground="white")])  # seen on the dark and on the bright end
 
 
-def ground_measurements(record: MissionRecord, site_model: SiteModel) -> Figure:
-    """Count rates measured along the rover's path, with a close-up of the place it searched."""
-    samples = record.samples.of_phase("ground")
+def driven_measurements(phase: Phase, record: MissionRecord, site_model: SiteModel) -> Figure:
+    """Count rates of a phase that was driven, along the planned paths, with a close-up of the place that it reached."""
+    samples = record.samples.of_phase(phase.name)
     centre, half = _close_up(record.estimate, samples.position_m[-1:, :2], site_model)
     figure, whole, close = plan.new_pair(site_model, centre, half)
     rate = smoothed_rate(samples)
     norm = log_scale(rate).norm
     x, y, _ = samples.position_m.T
+    paths = [record.paths_m[number] for number in phase.vehicles if number in record.paths_m]
     for axes, size in ((whole, 5.0), (close, 14.0)):
-        if len(record.route_m) > 1:
-            axes.plot(*record.route_m[:, :2].T, "-", color="0.45", linewidth=0.7, label="planned route", zorder=3)
+        for k, path in enumerate(paths):
+            label = "_" if k else "planned path"
+            axes.plot(*path[:, :2].T, "-", color="0.45", linewidth=0.7, label=label, zorder=3)
         axes.scatter(x, y, c=rate, s=size, cmap=RATE_MAP, norm=norm, linewidths=0, zorder=5, rasterized=True)
         plan.draw_truth(axes, record)
         plan.draw_estimate(axes, record.estimate, "final estimate, 95 % ellipse")
-    if len(rate) == 0:
-        plan.note(close, "no measurements\non the ground")
     bar = plan.colour_bar(figure, close, ScalarMappable(norm=norm, cmap=RATE_MAP), _RATE_LABEL)
     _plain_log_ticks(bar, norm)
     handles, _ = whole.get_legend_handles_labels()
@@ -170,16 +199,10 @@ def _close_up(
 
 
 def spectrum(record: MissionRecord, site_model: SiteModel) -> Figure:
-    """The rover's spectrum with the fit, its lines and the residuals."""
+    """The spectrum taken near the source, with the fit, its lines and the residuals."""
     del site_model
+    assert record.spectrum is not None
     return spectrum_figure(record.spectrum)
 
 
-FIGURES = {
-    "fig6_trajectories": trajectories,
-    "fig7_aerial_measurements": aerial_measurements,
-    "fig8_radiation_map": radiation_map,
-    "fig9_ground_measurements": ground_measurements,
-    "fig10_spectrum": spectrum,
-}
-__all__ = ["FIGURES", "write"]
+__all__ = ["figures_of", "write"]

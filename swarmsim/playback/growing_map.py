@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from swarmsim.missions.record import MissionRecord, RadiationMap, Samples
+from swarmsim.results.record import MissionRecord, RadiationMap, Samples
 from swarmsim.site.model import Site
 
 _VERTICES_PER_SIDE_MAX = 160  # keeps the recording small on a large site
@@ -65,8 +65,7 @@ def partial_map(samples: Samples, grid: MapGrid) -> tuple[NDArray[np.floating], 
     """Rate [ny, nx] in cps that ``samples`` show on ``grid``, and where they reach [ny, nx].
 
     Kernel estimate: counts and exposures are spread by the same Gaussian and divided (Nadaraya 1964, Watson 1964),
-    which needs no more than two filters a picture. The mission's own map, interpolated with its own method, replaces it
-    once the survey is over.
+    two filters for each picture. The mission's own map, interpolated by its own method, replaces it once it is made.
     """
     shape = (len(grid.y_m), len(grid.x_m))
     spacing = float(grid.x_m[1] - grid.x_m[0]) if shape[1] > 1 else 1.0
@@ -95,17 +94,16 @@ class Snapshot:
     seen: NDArray[np.bool_]  # [ny, nx] where there are data
 
 
-def snapshots(record: MissionRecord, count: int) -> list[Snapshot]:
-    """``count`` growing maps over the survey and, last, the mission's own; none if nothing was measured in flight."""
-    aerial = record.samples.of_phase("aerial")
-    if len(aerial.time_s) == 0:
+def snapshots(record: MissionRecord, made: RadiationMap, count: int) -> list[Snapshot]:
+    """``count`` growing maps until ``made``, the mission's own, and that last; none if nothing was measured."""
+    samples = record.samples.until(record.surveyed_s)
+    if len(samples.time_s) == 0:
         return []
-    grid = grid_of(record.map)
-    end = record.survey_end_s or float(aerial.time_s[-1])
-    made = []
-    for time in np.linspace(0.0, end, count + 2)[1:-1]:
-        so_far = aerial.until(time)
+    grid = grid_of(made)
+    grown = []
+    for time in np.linspace(record.start_s, record.surveyed_s, count + 2)[1:-1]:
+        so_far = samples.until(time)
         if len(so_far.time_s):
-            made.append(Snapshot(float(time), *partial_map(so_far, grid)))
-    mean = record.map.mean_cps[:: grid.stride, :: grid.stride]
-    return [*made, Snapshot(float(end), mean, np.isfinite(mean))]
+            grown.append(Snapshot(float(time), *partial_map(so_far, grid)))
+    mean = made.mean_cps[:: grid.stride, :: grid.stride]
+    return [*grown, Snapshot(float(record.surveyed_s), mean, np.isfinite(mean))]

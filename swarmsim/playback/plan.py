@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Patch
 from numpy.typing import NDArray
 
-from swarmsim.missions.record import Estimate, MissionRecord
 from swarmsim.playback.colours import ESTIMATE, TRUTH
+from swarmsim.results.record import Estimate, MissionRecord
 from swarmsim.site.model import SiteModel
 
 SINGLE_COLUMN_IN = 3.5  # 89 mm: one column of a two-column journal
@@ -134,11 +134,6 @@ def draw_site(axes: Axes, site_model: SiteModel) -> None:
 def building_patch() -> Patch:
     """Legend entry of the grey shapes: buildings, trees, walls."""
     return Patch(facecolor="0.7", edgecolor="none", label="obstacles")
-
-
-def note(axes: Axes, text: str) -> None:
-    """A sentence in the middle of axes that have nothing to show."""
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=8.0, zorder=9)
 
 
 def colour_bar(figure: Figure, axes: Axes, mappable: object, label: str) -> Axes:

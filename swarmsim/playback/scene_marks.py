@@ -1,52 +1,64 @@
-"""Marks in the recording's scene: true sources, estimates with their ellipsoids, hotspots, route, colour legends."""
+"""Marks in the scene: true sources, estimates with their ellipsoids, hotspots, planned paths, colour legends."""
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from swarmsim.missions.record import Estimate, MissionRecord
-from swarmsim.playback.blueprint import TIMELINE, site_bounds
-from swarmsim.playback.colours import ESTIMATE, TRUTH, RateScale, rgba
+from swarmsim.playback.blueprint import site_bounds
+from swarmsim.playback.colours import DRIVEN, ESTIMATE, FLOWN, TRUTH, RateScale, measured_phases, rgba, scale_name
+from swarmsim.playback.entities import TIMELINE, path_of
 from swarmsim.playback.growing_map import raster_at
+from swarmsim.results.record import Estimate, MissionRecord
 from swarmsim.site.model import SiteModel
 
 CHI2_95_3 = 7.815  # 95 % quantile of chi-squared, 3 degrees of freedom (NIST/SEMATECH e-Handbook, table 1.3.6.7.4)
-_ROUTE_ABOVE_GROUND_M = 0.5
-_AERIAL_ESTIMATE = "#56B4E9"
-_ROUTE, _HOTSPOT, _LABEL = [240, 240, 240, 255], [255, 255, 255, 255], [255, 255, 255, 255]
+_ABOVE_GROUND_M = 0.5
+_SURVEY_ESTIMATE = "#56B4E9"
+_PATH, _HOTSPOT, _LABEL = [240, 240, 240, 255], [255, 255, 255, 255], [255, 255, 255, 255]
 
 
 def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel) -> None:
-    """Truth from the start; hotspots, aerial estimate and route after the survey; final estimate after the drive."""
+    """Truth from the start; hotspots and the survey's estimate when they are made; the final estimate at the end."""
     for k, source in enumerate(record.sources):
         label = f"true {source.nuclide}, {source.activity_mbq:.0f} MBq"
         _pin(stream, f"truth/{k}", source.position_m, 7.0, label, TRUTH, static=True)
-    stream.set_time(TIMELINE, duration=float(record.survey_end_s))
-    _hotspots_and_route(stream, record, site_model)
-    if record.aerial_estimate is not None:
-        _estimate(stream, "estimate/aerial", record.aerial_estimate, "aerial", _AERIAL_ESTIMATE)
+    stream.set_time(TIMELINE, duration=float(record.surveyed_s))
+    _send_hotspots(stream, record, site_model)
+    if record.survey_estimate is not None:
+        _estimate(stream, "estimate/survey", record.survey_estimate, "survey", _SURVEY_ESTIMATE)
     stream.set_time(TIMELINE, duration=float(record.end_s))
     if record.estimate is not None:
         _estimate(stream, "estimate/final", record.estimate, "final", ESTIMATE)
         # The first guess has served; two pins a metre apart only hide each other.
-        stream.log("world/estimate/aerial/pin", rr.Clear(recursive=True))
-        stream.log("world/labels/estimate/aerial", rr.Clear(recursive=True))
+        stream.log("world/estimate/survey/pin", rr.Clear(recursive=True))
+        stream.log("world/labels/estimate/survey", rr.Clear(recursive=True))
     stream.reset_time()
 
 
-def _hotspots_and_route(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel) -> None:
-    thin = rr.Radius.ui_points(1.5)
-    if len(record.map.hotspots_m):
-        x, y = record.map.hotspots_m.T
-        z = raster_at(np.asarray(site_model.site.terrain_m), site_model.site, x, y) + _ROUTE_ABOVE_GROUND_M
-        angle = np.linspace(0.0, 2.0 * np.pi, 40)
-        ring = 2.5 * np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], -1)
-        rings = list(np.stack([x, y, z], -1)[:, None] + ring)
-        stream.log("world/hotspots", rr.LineStrips3D(rings, colors=[_HOTSPOT], radii=thin))
-    if len(record.route_m) > 1:
-        lifted = record.route_m + np.array([0.0, 0.0, _ROUTE_ABOVE_GROUND_M])
+def _send_hotspots(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel) -> None:
+    """A ring round each hotspot of the map."""
+    if record.map is None or not len(record.map.hotspots_m):
+        return
+    x, y = record.map.hotspots_m.T
+    z = raster_at(np.asarray(site_model.site.terrain_m), site_model.site, x, y) + _ABOVE_GROUND_M
+    angle = np.linspace(0.0, 2.0 * np.pi, 40)
+    ring = 2.5 * np.stack([np.cos(angle), np.sin(angle), np.zeros(40)], -1)
+    rings = list(np.stack([x, y, z], -1)[:, None] + ring)
+    stream.log("world/hotspots", rr.LineStrips3D(rings, colors=[_HOTSPOT], radii=rr.Radius.ui_points(1.5)))
+
+
+def send_paths(stream: rr.RecordingStream, record: MissionRecord) -> None:
+    """The planned path of each rover, from the beginning of its last phase; those of UAVs would hide the site."""
+    for number, points in record.paths_m.items():
+        starts = [phase.start_s for phase in record.phases if number in phase.vehicles]
+        if record.vehicles[number].flies or len(points) < 2 or not starts:
+            continue
+        stream.set_time(TIMELINE, duration=float(max(starts)))
+        lifted = np.asarray(points, float) + np.array([0.0, 0.0, _ABOVE_GROUND_M])
         # Thinner than the samples taken along it, which it would hide.
-        stream.log("world/route", rr.LineStrips3D([lifted], colors=[_ROUTE], radii=rr.Radius.ui_points(0.6)))
+        path = rr.LineStrips3D([lifted], colors=[_PATH], radii=rr.Radius.ui_points(0.6))
+        stream.log(path_of("world/paths", record.vehicles[number].name), path)
+    stream.reset_time()
 
 
 def _pin(
@@ -116,28 +128,31 @@ def send_legend(
     low, high = site_bounds(site_model)
     length, count = 0.30 * (high[0] - low[0]), 16
     block = length / count
-    for row, (phase, scale) in enumerate(scales.items()):
-        if len(record.samples.of_phase(phase).time_s) == 0:
-            continue
+    for row, (name, scale) in enumerate(scales.items()):
         rates = np.asarray(scale.norm.inverse(np.linspace(0.0, 1.0, count)), float)
         start = np.array([low[0] + (0.1 + 0.5 * row) * (high[0] - low[0]), low[1] - 2.5 * block, low[2]])
         centres = start + np.arange(count)[:, None] * [block, 0.0, 0.0]
         stream.log(
-            f"world/legend/{phase}/scale",
+            f"world/legend/{name}/scale",
             rr.Boxes3D(
                 centers=centres, half_sizes=[[0.5 * block] * 2 + [0.05]], colors=scale(rates), fill_mode="solid"
             ),
             static=True,
         )
-        name = {"aerial": "air", "ground": "ground"}[phase]
         stream.log(
-            f"world/legend/{phase}/ends",
+            f"world/legend/{name}/ends",
             rr.Points3D(
                 centres[[0, -1]],
                 radii=rr.Radius.ui_points(0.5),
                 colors=[_LABEL],
-                labels=[f"{name}: {rates[0]:.0f} cps", f"{rates[-1]:.0f} cps"],
+                labels=[f"{_legend_title(record, name)}: {rates[0]:.0f} cps", f"{rates[-1]:.0f} cps"],
                 show_labels=True,
             ),
             static=True,
         )
+
+
+def _legend_title(record: MissionRecord, name: str) -> str:
+    if name == DRIVEN:
+        return "ground"
+    return "air" if any(scale_name(record, phase) == FLOWN for phase in measured_phases(record)) else "map"

@@ -5,19 +5,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from swarmsim.missions.record import Spectrum
 from swarmsim.playback import plan
 from swarmsim.playback.colours import ESTIMATE, TRUTH
+from swarmsim.results.record import Spectrum
 
 _BINS = 256  # merged channels: narrower than any peak of NaI, wide enough for a readable histogram
 
 
-def spectrum_figure(spectrum: Spectrum | None) -> Figure:
-    """Counts on a logarithmic scale with fit and lines, standardised residuals below; a sentence if there is none."""
+def spectrum_figure(spectrum: Spectrum) -> Figure:
+    """Counts on a logarithmic scale with fit and lines, standardised residuals below."""
     figure = plan.new_figure(plan.DOUBLE_COLUMN_IN, 3.0)
-    if spectrum is None:
-        figure.text(0.5, 0.5, "No spectrum: nothing was found to identify.", ha="center", va="center", fontsize=9.0)
-        return figure
     upper = figure.add_axes((0.085, 0.36, 0.895, 0.56))
     lower = figure.add_axes((0.085, 0.13, 0.895, 0.20), sharex=upper)
     merge = max(1, len(spectrum.counts) // _BINS)

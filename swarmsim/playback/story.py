@@ -1,30 +1,31 @@
-"""What the recording tells in words: the mission log, line by line, and a page that sums it up."""
+"""The recording's texts: the mission log, line by line, and a page that sums it up."""
 
 import numpy as np
 import rerun as rr
 
-from swarmsim.missions.record import Estimate, MissionRecord
-from swarmsim.playback.blueprint import BODY_SCALE, TIMELINE
+from swarmsim.playback.entities import BODY_SCALE, TIMELINE
 from swarmsim.playback.spectrum_figure import spectrum_title
+from swarmsim.results.record import Estimate, MissionRecord
 
-_LEVEL = {"crash": "ERROR", "collision": "ERROR", "non_finite": "ERROR", "battery_empty": "WARN", "time_limit": "WARN"}
+_LEVEL = dict.fromkeys(("crash", "obstacle", "vehicle", "non_finite"), "ERROR")
+_LEVEL |= dict.fromkeys(("battery_empty", "time_limit"), "WARN")
 
 
 def story(record: MissionRecord) -> list[tuple[float, str, str]]:
     """Lines of the log in time order: simulated time (s), level, text."""
     lines = []
     for phase in record.phases:
+        late = "" if phase.in_time else ", by its time limit"
         lines.append((phase.start_s, "INFO", f"{phase.name} begins"))
-        lines.append((phase.end_s, "INFO", f"{phase.name} ends after {phase.end_s - phase.start_s:.0f} s"))
-    end = record.end_s
+        lines.append((phase.end_s, "INFO", f"{phase.name} ends after {phase.end_s - phase.start_s:.0f} s{late}"))
+    end, surveyed = record.end_s, record.surveyed_s
     for event in record.events:
         text = f"{event.vehicle}: {event.kind.replace('_', ' ')}" + (f" ({event.detail})" if event.detail else "")
         lines.append((min(event.time_s, end), _LEVEL.get(event.kind, "INFO"), text))
-    survey_end = record.survey_end_s
-    for x, y in record.map.hotspots_m:
-        lines.append((survey_end, "INFO", f"hotspot at {x:.1f} m east, {y:.1f} m north"))
+    for x, y in () if record.map is None else record.map.hotspots_m:
+        lines.append((surveyed, "INFO", f"hotspot at {x:.1f} m east, {y:.1f} m north"))
     for when, name, estimate in (
-        (survey_end, "estimate from the air", record.aerial_estimate),
+        (surveyed, "survey estimate", record.survey_estimate),
         (end, "final estimate", record.estimate),
     ):
         if estimate is not None:
@@ -32,6 +33,7 @@ def story(record: MissionRecord) -> list[tuple[float, str, str]]:
     if record.spectrum is not None:
         named = spectrum_title(record.spectrum)
         lines.append((end, "INFO", f"spectrum of {record.spectrum.live_time_s:.0f} s live: {named}"))
+    lines += [(end, "WARN", warning) for warning in record.warnings]
     lines.append((end, "INFO", record.finding))
     return sorted(lines, key=lambda line: line[0])
 
@@ -69,16 +71,27 @@ def page(record: MissionRecord) -> str:
     )
     found = "\n".join(
         f"- {name}: {describe(estimate)}"
-        for name, estimate in (("from the air", record.aerial_estimate), ("final", record.estimate))
+        for name, estimate in (("survey estimate", record.survey_estimate), ("final estimate", record.estimate))
         if estimate is not None
     )
+    warnings = "".join(f"\n\nWarning: {warning}" for warning in record.warnings)
     return (
-        f"# {record.name}\n\nSite {record.site}, seed {record.seed}\n\n**{record.finding}**\n\n{truth}\n{found}\n\n"
-        f"| vehicle | type | energy [Wh] | |\n|---|---|---|---|\n{team}\n\n"
-        f"Drawn larger than life: multirotors {BODY_SCALE['multirotor']:g} times, rovers {BODY_SCALE['skid_steer']:g} "
-        "times. Points are coloured by the count rate averaged over 1 s; "
-        "ellipsoids hold 95 %.\n"
+        f"# {record.name}\n\nSite {record.site}, seed {record.seed}\n\n**{record.finding}**{warnings}\n\n"
+        f"{truth}\n{found}\n\n| vehicle | type | energy [Wh] | |\n|---|---|---|---|\n{team}\n\n{_drawn(record)}\n"
     )
+
+
+def _drawn(record: MissionRecord) -> str:
+    """How to read the scene."""
+    kinds = {"multirotor": "multirotors", "skid_steer": "rovers"}
+    there = {vehicle.kind for vehicle in record.vehicles}
+    sizes = ", ".join(f"{name} {BODY_SCALE[kind]:g} times" for kind, name in kinds.items() if kind in there)
+    sentences = [f"Drawn larger than life: {sizes}."]
+    if len(record.samples.time_s):
+        sentences.append("Points are coloured by the count rate averaged over 1 s.")
+    if record.estimate is not None:
+        sentences.append("Ellipsoids hold 95 %.")
+    return " ".join(sentences)
 
 
 def send_summary(stream: rr.RecordingStream, record: MissionRecord) -> None:

@@ -6,8 +6,7 @@ from pathlib import Path
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.names import one_of
-
-RECORDING = "mission.rrd"
+from swarmsim.results.names import RECORDING
 
 
 def recording_of(run: Path) -> Path:

@@ -5,65 +5,104 @@ area, which is one cell of that decomposition.
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.policies.path import Path, limit_speed, resample
+from swarmsim.config.policies import ParallelLines, line_spacing
+from swarmsim.policies.air_path import FlightProfile, air_path, flight_profile, points_for
+from swarmsim.policies.path import Path
+from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
-from swarmsim.policies.tasks import AerialTask
-from swarmsim.site import Site, sample
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-CLIMB_GRADIENT = 0.7  # a survey path climbs at most 7 m in 10 m, about 35 degrees
-BELOW_GROUND_M = 0.4  # the landing path ends here, so that the vehicle comes down until it touches
-TOUCHDOWN_HEIGHT_M = 2.5  # below this height the descent is slow
-CORNER_M = 0.5  # how far a corner may be cut
-VERTICAL_POINTS = 32
+from swarmsim.pytree import pytree, static
+from swarmsim.site import Site
 
 
-def lines_needed(area_m: "ArrayLike", line_spacing_m: float, sweep_rad: float) -> int:
+@pytree
+class SurveyTask:
+    """Survey an area with M multirotors."""
+
+    profile: FlightProfile
+    area_m: jax.Array  # [V, 2] convex polygon, world
+    home_m: jax.Array  # [M, 2] where each lands, world
+    line_spacing_m: jax.Array  # []
+    sweep_rad: jax.Array  # [] direction of the lines, counter-clockwise from east
+    lines_max: int = static()  # most lines that the area can need
+    bands: int = static()  # pieces that every line is cut into
+    points: int = static()  # points of a path
+
+
+def lines_needed(area_m: np.ndarray, line_spacing_m: float, sweep_rad: float) -> int:
     """How many parallel lines an area [V, 2] takes (host)."""
-    across = np.asarray(area_m) @ np.array([-math.sin(sweep_rad), math.cos(sweep_rad)])
+    across = area_m @ np.array([-math.sin(sweep_rad), math.cos(sweep_rad)])
     return max(1, math.floor((across.max() - across.min()) / line_spacing_m + 1e-6))
 
 
-def points_needed(area_m: "ArrayLike", home_m: "ArrayLike", lines: int, altitude_m: float, spacing_m: float) -> int:
-    """How many points a path takes so that they stand about ``spacing_m`` apart (host; an upper bound)."""
-    area, homes = np.asarray(area_m), np.asarray(home_m)
-    extent = float(np.linalg.norm(np.ptp(np.concatenate([area, homes]), axis=0)))
-    share = math.ceil(lines / len(homes)) + 1
-    length = share * extent + 2 * extent + 4 * altitude_m
-    return 256 * math.ceil(length / spacing_m / 256)
+def bands_needed(area_m: np.ndarray, lines: int, vehicles: int, sweep_rad: float) -> int:
+    """Into how many pieces lines are cut: one, unless there are too few lines for so many vehicles (host).
 
-
-@register("aerial", "parallel_lines")
-def parallel_lines(task: AerialTask, site: Site) -> Path:
-    """One path per UAV: take off, fly its share of the lines at height above ground, return, land.
-
-    Lines stand ``line_spacing_m`` apart, centred on the area, and are cut to it. Each UAV gets neighbouring lines, so
-    that their summed lengths are equal within a line; UAVs are matched to parts in the order of their homes across the
-    lines, so that their ways do not cross. Every UAV flies its part in the order and direction with the least transit.
-
-    Returns:
-        `Path` with a leading axis U on every field.
+    Then it divides the vehicles, so that nobody's part lies in two bands, and parts are as square as that allows.
     """
-    start, end, used = _cut_lines(task)
-    share = _share(start, end, used, task.home_m.shape[0])
-    across = jnp.array([-jnp.sin(task.sweep_rad), jnp.cos(task.sweep_rad)])
-    rank = jnp.argsort(jnp.argsort(task.home_m @ across))
-
-    def fly(home: jax.Array, part: jax.Array) -> Path:
-        return _path(task, site, home, _lawnmower(home, start, end, used & (share == part)))
-
-    return jax.vmap(fly)(task.home_m, rank)
+    if lines >= 2 * vehicles:
+        return 1
+    along = np.array([math.cos(sweep_rad), math.sin(sweep_rad)])
+    across = np.array([-along[1], along[0]])
+    square = math.sqrt(vehicles * np.ptp(area_m @ along) / np.ptp(area_m @ across))
+    enough = [n for n in range(1, vehicles + 1) if vehicles % n == 0 and lines * n >= vehicles]
+    return min(enough, key=lambda n: abs(math.log(n / square)))
 
 
-def _cut_lines(task: AerialTask) -> tuple[jax.Array, jax.Array, jax.Array]:
+@register("parallel_lines")
+class ParallelLinesPlanner:
+    """Survey an area along parallel lines, shared among the UAVs in balanced parts."""
+
+    Settings = ParallelLines
+    vehicles = ("multirotor",)
+
+    def task(self, assignment: Assignment) -> SurveyTask:
+        """Area, lines and sizes of the phase (host)."""
+        settings, scenario = assignment.settings, assignment.scenario
+        assert isinstance(settings, ParallelLines)
+        area = np.asarray(settings.area_m or assignment.site_model.site.survey_area_m, np.float64)
+        homes = np.array([scenario.members[i].position_m for i in assignment.members], np.float64)
+        spacing, sweep = line_spacing(settings), math.radians(settings.sweep_deg)
+        lines = lines_needed(area, spacing, sweep)
+        extent = float(np.linalg.norm(np.ptp(np.concatenate([area, homes]), axis=0)))
+        bands = bands_needed(area, lines, len(homes), sweep)
+        share = math.ceil(lines * bands / len(homes)) + 1
+        piece = float(np.linalg.norm(np.ptp(area, axis=0))) / bands
+        return SurveyTask(
+            profile=flight_profile(settings, [scenario.vehicles[i] for i in assignment.members]),
+            area_m=np.asarray(area, np.float32),
+            home_m=np.asarray(homes, np.float32),
+            line_spacing_m=np.float32(spacing),
+            sweep_rad=np.float32(sweep),
+            lines_max=lines,
+            bands=bands,
+            points=points_for(share * (piece + spacing) + 3 * extent, settings.altitude_m),
+        )
+
+    def plan(self, task: SurveyTask, site: Site, situation: Situation) -> Path:
+        """One path per UAV: take off, fly its share of the lines at height above ground, return, land.
+
+        Lines stand ``line_spacing_m`` apart, centred on the area, and are cut to it. Each UAV gets neighbouring lines,
+        so that their summed lengths are equal within a line; UAVs are matched to parts in the order of their places
+        across the lines, so that their ways do not cross. Every UAV flies its part in the order and direction with the
+        least transit.
+        """
+        start, end, used = _pieces(*_cut_lines(task), task.bands)
+        share = _share(start, end, used, task.home_m.shape[0])
+        rank = _places_in_order(task, situation.position_m[:, :2])
+
+        def fly(position: jax.Array, home: jax.Array, part: jax.Array) -> Path:
+            corners = _lawnmower(home, start, end, used & (share == part))
+            return air_path(task.profile, site, position, home, corners[1:-1], task.points)
+
+        return jax.vmap(fly)(situation.position_m, task.home_m, rank)
+
+
+def _cut_lines(task: SurveyTask) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Line ends [L, 2], [L, 2] in ENU and which of the L lines are used."""
     along = jnp.array([jnp.cos(task.sweep_rad), jnp.sin(task.sweep_rad)])
     across = jnp.array([-along[1], along[0]])
@@ -83,6 +122,24 @@ def _cut_lines(task: AerialTask) -> tuple[jax.Array, jax.Array, jax.Array]:
     low, high = jnp.where(used, low, 0.0), jnp.where(used, high, 0.0)
     offset = at[:, None] * across
     return low[:, None] * along + offset, high[:, None] * along + offset, used
+
+
+def _pieces(
+    start: jax.Array, end: jax.Array, used: jax.Array, bands: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Lines [L, 2] cut into ``bands`` equal pieces [bands L, 2] each: the first pieces of all lines, then the second."""
+    edge = jnp.linspace(0.0, 1.0, bands + 1)[:, None, None]
+    cut = start + edge * (end - start)
+    return cut[:-1].reshape(-1, 2), cut[1:].reshape(-1, 2), jnp.tile(used, bands)
+
+
+def _places_in_order(task: SurveyTask, position_m: jax.Array) -> jax.Array:
+    """Rank [M] of vehicles at ``position_m`` [M, 2] in the order of the parts: along the lines by bands, then across."""
+    along = jnp.array([jnp.cos(task.sweep_rad), jnp.sin(task.sweep_rad)])
+    across = jnp.array([-along[1], along[0]])
+    count = position_m.shape[0]
+    band = jnp.argsort(jnp.argsort(position_m @ along)) * task.bands // count
+    return jnp.argsort(jnp.lexsort((position_m @ across, band)))
 
 
 def _share(start: jax.Array, end: jax.Array, used: jax.Array, parts: int) -> jax.Array:
@@ -110,41 +167,3 @@ def _lawnmower(home: jax.Array, start: jax.Array, end: jax.Array, mine: jax.Arra
     options = jax.vmap(corners)(jnp.array([False, False, True, True]), jnp.array([False, True, False, True]))
     lengths = jnp.linalg.norm(jnp.diff(options, axis=1), axis=-1).sum(axis=-1)
     return options[jnp.argmin(lengths)]
-
-
-def _path(task: AerialTask, site: Site, home: jax.Array, corners: jax.Array) -> Path:
-    """Lift the corners above terrain and obstacles, add take-off and landing, set speeds."""
-    flat, flat_length = resample(corners, task.points)
-    height = _safe_height(task, site, flat, flat_length / (task.points - 1))
-    survey = jnp.concatenate([flat, height[:, None]], axis=-1)
-    ground = sample(site.terrain_m, site, home)
-    rise = jnp.linspace(0.0, 1.0, VERTICAL_POINTS)[:, None]
-    foot = jnp.append(home, ground)
-    below = jnp.append(home, ground - BELOW_GROUND_M)
-    whole = jnp.concatenate([foot + rise * (survey[0] - foot), survey, survey[-1] + rise * (below - survey[-1])])
-    points, length = resample(whole, task.points)
-    vertical = jnp.asarray(jnp.gradient(points[:, 2])) / jnp.maximum(length / (task.points - 1), 1e-6)
-    low = points[:, 2] < ground + TOUCHDOWN_HEIGHT_M
-    down = jnp.where(low, task.touchdown_speed_m_s, task.descent_speed_m_s)
-    cruise = jnp.where(vertical > 0.9, task.climb_speed_m_s, jnp.where(vertical < -0.9, down, task.speed_m_s))
-    speed = limit_speed(points, cruise, task.acceleration_m_s2, CORNER_M)
-    # the landing must not stop above ground: the last points keep the touchdown speed
-    landing = low & (jnp.arange(task.points) > task.points // 2)
-    speed = jnp.where(landing, task.touchdown_speed_m_s, speed)
-    return Path(points_m=points, speed_m_s=speed, spacing_m=length / (task.points - 1), length_m=length)
-
-
-def _safe_height(task: AerialTask, site: Site, xy: jax.Array, spacing: jax.Array) -> jax.Array:
-    """Height [P] that keeps the altitude above ground and the clearance above the surface around each point.
-
-    Higher ground ahead is met by climbing before it, at `CLIMB_GRADIENT`.
-    """
-    ring = jnp.linspace(0.0, 2.0 * jnp.pi, 8, endpoint=False)
-    offsets = jnp.stack([jnp.cos(ring), jnp.sin(ring)], axis=-1)
-    around = xy[:, None, None] + jnp.array([0.0, 0.5, 1.0])[:, None, None] * task.obstacle_clearance_m * offsets
-    surface = jnp.max(sample(site.surface_m, site, around), axis=(1, 2))
-    wanted = jnp.maximum(sample(site.terrain_m, site, xy) + task.altitude_m, surface + task.obstacle_clearance_m)
-    slope = CLIMB_GRADIENT * spacing * jnp.arange(len(wanted))
-    ahead = jax.lax.cummax(wanted - slope, reverse=True) + slope
-    behind = jax.lax.cummax(wanted + slope) - slope
-    return jnp.maximum(ahead, behind)

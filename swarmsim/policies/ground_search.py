@@ -1,64 +1,102 @@
-"""The rover's drive: over the traversability cost to the hotspot and round it."""
+"""A rover's search round a target: the cheapest way there, then viewpoints all round it."""
 
+import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from swarmsim.policies.path import Path, limit_speed, resample
+from swarmsim.config.policies import ApproachAndOrbit as ApproachAndOrbitSettings
+from swarmsim.policies.ground_path import ROUTE_POINTS, ground_path, planning_cells, route_grid, rover_limits
+from swarmsim.policies.path import Path
+from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
-from swarmsim.policies.routes import coarsen, cost_to_go, descend, smooth
-from swarmsim.policies.tasks import GroundTask
-from swarmsim.site import Site, sample
+from swarmsim.policies.routes import cost_to_go, descend
+from swarmsim.pytree import pytree, static
+from swarmsim.site import Site
 
+ROUTE_WINDOW_M = 25.0  # a route round the target stays this close to it
 RINGS = 9  # a viewpoint is looked for at the standoff and on 8 rings beyond it …
 RING_STEP = 0.25  # … this share of the standoff apart
-SMOOTHING_M = 1.0  # half width of the moving average that rounds the grid's corners
-CORNER_M = 0.3  # how far the rover may cut a corner
-START_COST = 10.0  # a rover that starts beside an obstacle may leave its cell at this cost per metre
 
 
-@register("ground", "approach_and_orbit")
-def approach_and_orbit(task: GroundTask, site: Site) -> Path:
-    """Drive the cheapest way to the target, then visit viewpoints all round it, at the standoff or the nearest beyond.
+@pytree
+class SearchTask:
+    """Drive M rovers to a target and around it."""
 
-    Viewpoints that cannot be reached are left out; they are visited in their order round the target, from the one
-    that is cheapest to reach. If none can be reached the path has length zero: the rover stays where it is.
-    """
-    cell = site.cell_m * task.block
-    origin = site.origin_m + 0.5 * (task.block - 1) * site.cell_m
-    cost = coarsen(site.cost, site.clearance_m, task.rover_radius_m, task.block)
+    standoff_m: jax.Array  # [] distance at which to look at the target
+    speed_m_s: jax.Array  # []
+    acceleration_m_s2: jax.Array  # [M]
+    radius_m: jax.Array  # [M] clearance that each rover needs
+    viewpoints: int = static()  # places round the target to visit
+    laps: int = static()  # times round the target
+    block: int = static()  # cells of the site's rasters along one edge of a planning cell
+    window: int = static()  # planning cells that a route round the target may stray from it
+    points: int = static()  # points of the path
 
-    def cell_of(xy: jax.Array) -> jax.Array:
-        place = jnp.round((xy - origin) / cell).astype(jnp.int32)[..., ::-1]
-        return jnp.clip(place, 0, jnp.array(cost.shape) - 1)
 
-    start = cell_of(task.start_m)
-    cost = cost.at[start[0], start[1]].min(START_COST)
-    from_start = cost_to_go(cost, start, cell)
-    views, reachable = _viewpoints(task, from_start, cell_of)
-    first, legs, any_leg = _tour(task, cost, from_start, views, reachable, cell_of(task.target_m), cell)
-    approach = descend(from_start, cost, first, cell, 2 * sum(cost.shape))[::-1]
-    cells = jnp.concatenate([approach, legs.reshape(-1, 2)])
-    xy = (origin + cell * cells[:, ::-1].astype(jnp.float32)).at[0].set(task.start_m)
-    return _path(task, site, jnp.where(any_leg, xy, task.start_m))
+@register("approach_and_orbit")
+class ApproachAndOrbit:
+    """Drive the cheapest way to a target, then visit viewpoints all round it."""
+
+    Settings = ApproachAndOrbitSettings
+    vehicles = ("skid_steer",)
+
+    def task(self, assignment: Assignment) -> SearchTask:
+        """Distances, speeds and sizes of the phase (host)."""
+        settings = assignment.settings
+        assert isinstance(settings, ApproachAndOrbitSettings)
+        block, cell = planning_cells(assignment.site_model.site)
+        radius, acceleration = rover_limits(assignment)
+        return SearchTask(
+            standoff_m=np.float32(settings.standoff_m),
+            speed_m_s=np.float32(settings.speed_m_s),
+            acceleration_m_s2=acceleration,
+            radius_m=radius,
+            viewpoints=settings.viewpoints,
+            laps=settings.laps,
+            block=block,
+            window=math.ceil(ROUTE_WINDOW_M / cell),
+            points=ROUTE_POINTS,
+        )
+
+    def plan(self, task: SearchTask, site: Site, situation: Situation) -> Path:
+        """A path for each rover, of length zero where no viewpoint can be reached: it then stays where it is.
+
+        Viewpoints stand at the standoff or the nearest beyond; those that cannot be reached are left out. They are
+        visited in their order round the target, from the one that is cheapest to reach.
+        """
+
+        def one(position: jax.Array, radius: jax.Array, acceleration: jax.Array) -> Path:
+            grid = route_grid(site, radius, task.block, position[:2])
+            target = grid.cell_of(situation.target_m)
+            from_start = cost_to_go(grid.cost, grid.cell_of(position[:2]), grid.cell_m)
+            views, reachable = _viewpoints(task, situation.target_m, from_start, grid.cell_of)
+            first, legs, any_leg = _tour(task, grid.cost, from_start, views, reachable, target, grid.cell_m)
+            approach = descend(from_start, grid.cost, first, grid.cell_m, 2 * sum(grid.cost.shape))[::-1]
+            xy = grid.place(jnp.concatenate([approach, legs.reshape(-1, 2)])).at[0].set(position[:2])
+            xy = jnp.where(any_leg & situation.found, xy, position[:2])
+            return ground_path(site, xy, task.speed_m_s, acceleration, task.points)
+
+        return jax.vmap(one)(situation.position_m, task.radius_m, task.acceleration_m_s2)
 
 
 def _viewpoints(
-    task: GroundTask, from_start: jax.Array, cell_of: Callable[[jax.Array], jax.Array]
+    task: SearchTask, target_m: jax.Array, from_start: jax.Array, cell_of: Callable[[jax.Array], jax.Array]
 ) -> tuple[jax.Array, jax.Array]:
     """Cells [n, 2] round the target, each on the innermost ring where the rover can go, and which exist [n]."""
     angle = 2.0 * jnp.pi * jnp.arange(task.viewpoints) / task.viewpoints
     ring = task.standoff_m * (1.0 + RING_STEP * jnp.arange(RINGS))
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    cells = cell_of(task.target_m + ring[None, :, None] * direction[:, None, :])
+    cells = cell_of(target_m + ring[None, :, None] * direction[:, None, :])
     free = jnp.isfinite(from_start[cells[..., 0], cells[..., 1]])
     innermost = jnp.argmax(free, axis=1)
     return jnp.take_along_axis(cells, innermost[:, None, None], axis=1)[:, 0], jnp.any(free, axis=1)
 
 
 def _tour(
-    task: GroundTask,
+    task: SearchTask,
     cost: jax.Array,
     from_start: jax.Array,
     views: jax.Array,
@@ -90,14 +128,3 @@ def _tour(
 
     legs = jax.vmap(leg)(order[:-1], order[1:]) if len(order) > 1 else views[order][None]
     return views[first], legs, jnp.any(reachable)
-
-
-def _path(task: GroundTask, site: Site, corners_m: jax.Array) -> Path:
-    """Round the grid's corners, set the speeds and lay the path on the terrain."""
-    flat, length = resample(corners_m, task.points)
-    half_width = (SMOOTHING_M * (task.points - 1) / jnp.maximum(length, 1.0)).astype(jnp.int32)
-    flat, length = resample(smooth(flat, half_width), task.points)
-    points = jnp.concatenate([flat, sample(site.terrain_m, site, flat)[:, None]], axis=-1)
-    cruise = jnp.full(task.points, task.speed_m_s)
-    speed = limit_speed(points, cruise, task.acceleration_m_s2, CORNER_M)
-    return Path(points_m=points, speed_m_s=speed, spacing_m=length / (task.points - 1), length_m=length)

@@ -77,14 +77,14 @@ def reference(path: Path, progress_m: jax.Array, speed_min_m_s: float = 0.0) -> 
     """
     at = jnp.clip(progress_m, 0.0, path.length_m) / jnp.maximum(path.spacing_m, 1e-6)
     low = jnp.clip(at.astype(jnp.int32), 0, path.points_m.shape[0] - 2)
-    rows = jnp.concatenate([path.points_m, path.speed_m_s[:, None]], axis=-1)
-    ends = jax.lax.dynamic_slice(rows, (low, 0), (2, rows.shape[1]))
-    here = ends[0] + (at - low) * (ends[1] - ends[0])
-    speed = jnp.maximum(here[3], speed_min_m_s)
-    direction = (ends[1, :3] - ends[0, :3]) / jnp.maximum(path.spacing_m, 1e-6)
+    ends = jax.lax.dynamic_slice(path.points_m, (low, 0), (2, path.points_m.shape[1]))
+    limits = jax.lax.dynamic_slice(path.speed_m_s, (low,), (2,))
+    part = at - low
+    speed = jnp.maximum(limits[0] + part * (limits[1] - limits[0]), speed_min_m_s)
+    direction = (ends[1] - ends[0]) / jnp.maximum(path.spacing_m, 1e-6)
     moving = progress_m < path.length_m
     return Reference(
-        position_m=here[:3],
+        position_m=ends[0] + part * (ends[1] - ends[0]),
         velocity_m_s=jnp.where(moving, speed * direction, 0.0),
         speed_m_s=jnp.where(moving, speed, 0.0),
     )

@@ -1,6 +1,6 @@
 """Gamma radiation: nuclides, attenuation and build-up, detector response, counts, spectra and identification.
 
-A nuclide, a material or a detector is a file in ``configs``; nothing here names one, apart from air.
+Nuclides, materials and detectors are files in ``configs``; the code names none of them, apart from air.
 """
 
 from swarmsim.radiation.detector import KINDS, Detector, Source, build_detector, restrict

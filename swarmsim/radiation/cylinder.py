@@ -1,4 +1,4 @@
-"""A cylindrical crystal seen from a point: its silhouette, its solid angle, and what crosses it.
+"""Geometry of a cylindrical crystal seen from a point: silhouette, solid angle and effective area.
 
 Directions are given by u = |cos| and s = sin of the angle between the crystal's axis and the line to the source.
 """
@@ -22,12 +22,12 @@ def solid_angle_per_area(
 ) -> jax.Array:
     """Solid-angle fraction of the crystal over its silhouette [1/m2], at ``distance_m`` from the crystal's centre.
 
-    The end face and the side count apart, each as a disc of its own area seen under its own angle (`_disc_fraction`).
-    On the axis that is the exact solid angle of the face at any distance, a half in contact and inside the crystal.
-    The face is seen under the height h above it and the part of the offset that leads beyond its rim; the side as the
-    rectangle between its tangents, pi/8 of a radius in front of the axis (where the curved rims of a side-on crystal
-    lie on average), first from its own height and further off from its middle. Within 7 % of the true solid angle
-    from 6 cm on at any angle, 3 % from 1 m on (2 inch crystal), and exact far away: silhouette / (4 pi r^2).
+    The end face and the side are each approximated by a disc of their area at its own angle (`_disc_fraction`). On the
+    axis that is the exact solid angle of the face at any distance, and one half in contact and inside the crystal. The
+    face is seen from the height h above it and the part of the offset that lies beyond its rim; the side is the
+    rectangle between its tangents, pi/8 of a radius in front of the axis (the mean position of the curved rims of a
+    side-on crystal), seen from its own height when near and from its middle when far. For a 2 inch crystal the error is
+    below 7 % from 6 cm on at any angle and below 3 % from 1 m on; far away it vanishes: silhouette / (4 pi r^2).
     """
     offset, height = distance_m * s, distance_m * u
     above = jnp.maximum(height - 0.5 * length_m, 0.0)
@@ -56,19 +56,19 @@ def _disc_fraction(area: jax.Array, height: jax.Array, offset2: jax.Array) -> ja
 
 
 def direction_basis(u: jax.Array, s: jax.Array) -> jax.Array:
-    """The five functions [5] of direction in which the effective area is written; see `fit_effective_area`."""
+    """Basis [5] of functions of the direction for the effective area; see `fit_effective_area`."""
     return jnp.stack([jnp.ones_like(u), u, s, u * s, u * u])
 
 
 def absorbing_area(radius_m: float, length_m: float, u: float, attenuation_1_m: Floats) -> Floats:
-    """Silhouette weighted with the chance to interact [m2], for parallel rays and each attenuation [k].
+    """Integral of the interaction probability over the silhouette [m2], for parallel rays and each attenuation [k].
 
-    The integral of 1 - exp(-mu l) over the silhouette, l the chord of each ray; host side, by midpoint rays.
+    The probability is 1 - exp(-mu l) for a ray with chord l. Host side, with the midpoint rule.
     """
     s = float(np.sqrt(max(1.0 - u * u, 0.0)))
     half = radius_m * u + 0.5 * length_m * s
     offsets = (np.arange(_RAYS) + 0.5) / _RAYS * 2.0 - 1.0
-    # sin substitution across the axis: midpoints stay accurate at the round edge
+    # sine substitution across the axis: the midpoint rule stays accurate at the round edge
     angle = offsets * 0.5 * np.pi
     across = radius_m * np.sin(angle)
     cell = (radius_m * np.cos(angle) * np.pi / _RAYS)[None, :] * (2.0 * half / _RAYS)
@@ -90,8 +90,8 @@ def absorbing_area(radius_m: float, length_m: float, u: float, attenuation_1_m: 
 def fit_effective_area(radius_m: float, length_m: float, attenuation_1_m: Floats) -> Floats:
     """Coefficients [k, 5] of `direction_basis` for the absorbing area of each attenuation [k]; host side.
 
-    A transparent crystal shows its volume (the constant), an opaque one its silhouette (u and s): the basis holds both
-    limits, and the fit between them is within 1 % of `absorbing_area` at any angle.
+    The limit of a transparent crystal is its volume (the constant), that of an opaque one its silhouette (u and s). The
+    basis contains both limits, and the fit between them is within 1 % of `absorbing_area` at any angle.
     """
     angles = np.linspace(0.0, 0.5 * np.pi, 13)
     u, s = np.cos(angles), np.sin(angles)

@@ -1,4 +1,4 @@
-"""Detectors and sources as arrays, and how a detector is built from its configuration (host side)."""
+"""Detectors and sources as arrays, and construction of a detector from its configuration (host side)."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from swarmsim.radiation.response import (
 Floats = NDArray[np.float64]
 
 KINDS = ("physical", "paper_ideal")
-AIR = "air"  # the material of whatever lies between a source and a detector and is nothing else
+AIR = "air"  # material of the part of a ray that lies in no obstacle
 
 
 @pytree
@@ -51,9 +51,9 @@ class Detector:
     yields: jax.Array  # [N, L] photons per decay
     effective_area_m2: jax.Array  # [N, L, 5] coefficients of cylinder.direction_basis, housing and efficiency included
     transport_1_m: jax.Array  # [N, 4, L, M] linear attenuation mu, and mu times build-up C, D, P of each material
-    shielding: jax.Array  # [N, 4, L] optical depth, and depth times C, D, P, of what `identify` allows for
+    shielding: jax.Array  # [N, 4, L] optical depth, and depth times C, D, P, of the shielded template of `identify`
     peak_spectrum: jax.Array  # [N, L, channels] share of the counts of unscattered photons in each channel, sums to 1
-    scattered_spectrum: jax.Array  # [N, L, channels] same of photons that scattered on their way
+    scattered_spectrum: jax.Array  # [N, L, channels] same for photons that scattered before the crystal
     background_spectrum: jax.Array  # [channels] cps, sums to background_cps
     energy_kev: jax.Array  # [channels] centre of each channel
     line_energy_kev: jax.Array  # [N, L]
@@ -67,8 +67,9 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
     """Detector ``spec`` mounted as ``mount`` with the tables of every nuclide and material of ``library``.
 
     ``kind`` is ``physical`` or ``paper_ideal``: the latter counts every photon that meets the crystal (no housing, no
-    efficiency), is blind to air and to scattered photons, and draws as the Gazebo plugin of the paper does. Raises
-    `InputError` when the crystal or the housing is made of an unknown material or a table does not reach a line.
+    efficiency), neglects attenuation in air and scattered photons, and draws counts as the Gazebo plugin of the paper
+    does. Raises `InputError` when the material of the crystal or the housing is unknown, or when a table does not reach
+    the energy of a line.
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {KINDS}, not {kind!r}")
@@ -116,9 +117,9 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
 
 
 def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
-    """The same detector with the tables of ``nuclides`` alone, in that order, and no more lines than they have (host).
+    """The same detector with only the tables of ``nuclides``, in that order, and as many lines as they have (host).
 
-    An estimator that presumes one nuclide runs several times faster with it. Raises `InputError` for an unknown name.
+    An estimator for one known nuclide runs several times faster with it. Raises `InputError` for an unknown name.
     """
     missing = [name for name in nuclides if name not in detector.nuclide_names]
     if missing or not nuclides:
@@ -156,7 +157,7 @@ def _shielding(material: Material, energy: Floats, kind: str) -> Floats:
 
 
 def _identification_bins(response: Response) -> tuple[int, ...]:
-    """First channels of bins a third of the resolution wide, from the threshold on; the end closes the last bin."""
+    """First channels of bins a third of the resolution (FWHM) wide, from the threshold, and the end of the last bin."""
     starts = [int(np.searchsorted(response.channel_edge_kev, response.threshold_kev))]
     end = len(response.channel_centre_kev)
     while starts[-1] < end:

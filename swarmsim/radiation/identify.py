@@ -1,12 +1,12 @@
-"""Which nuclide a spectrum shows, with an honest probability (device side).
+"""Bayesian identification of the nuclides in a spectrum (device side).
 
-The hypotheses: background alone; background and an unknown source of which only scattered photons are seen;
+The hypotheses: background only; background and an unknown source of which only scattered photons are detected;
 background and one nuclide; background and two. Under each, the spectrum is a non-negative sum of templates: the
-background, two smooth continua for photons scattered anywhere, and for each nuclide its spectrum as emitted and as it
-leaves thick shielding, so that hardening on the way costs no likelihood. The fit is of maximum Poisson likelihood
-(expectation maximisation; a template that starts at zero stays there, so all hypotheses are one matrix).
-Posterior = likelihood x Occam factor of the source's strength x prior, where each bin's deviance is lessened for the
-templates' own error.
+background, two smooth continua of scattered photons, and for each nuclide its spectrum as emitted and behind thick
+shielding, which allows for spectral hardening. The fit maximises the Poisson likelihood by expectation maximisation; a
+template that starts at zero stays at zero, so that one matrix fits all hypotheses.
+Posterior = likelihood x Occam factor of the source's strength x prior, where each bin's deviance is reduced to account
+for the error of the templates.
 """
 
 import itertools
@@ -23,31 +23,31 @@ from swarmsim.radiation.rate import transmission
 
 ITERATIONS = 150
 _RELAXATION = 1.6  # exponent of the multiplicative step; below 2 it still converges and needs fewer steps
-# Prior: a hotspot may turn out to be natural, may be hidden behind too much matter, and rarely is a mixture.
+# Prior: a hotspot may be natural background, may be heavily shielded, and is rarely a mixture.
 _PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO = 0.4, 0.1, 0.4, 0.1
 _TEMPLATE_ERROR = 0.04  # relative error of the templates in a bin: an estimate
-_STRENGTH_SCALE = 0.3  # of the background, of the half-Cauchy prior of a source's strength
-_COUNTS_FLOOR = 0.05  # per bin: keeps the information finite where hardly anything is expected
+_STRENGTH_SCALE = 0.3  # scale of the half-Cauchy prior of a source's strength, in units of the background
+_COUNTS_FLOOR = 0.05  # per bin: keeps the information finite where almost no counts are expected
 _SMOOTH = 3  # templates shared by the hypotheses: background and the two continua
 
 
 @pytree
 class Identification:
-    """What a spectrum says; N nuclides in the order of the detector's ``nuclide_names``."""
+    """Result of `identify`; N nuclides in the order of the detector's ``nuclide_names``."""
 
-    nuclide: jax.Array  # [] int32 the nuclide that explains most counts; -1 when none is named
-    confidence: jax.Array  # [] probability that it is present; of bare background when none is named
+    nuclide: jax.Array  # [] int32 nuclide that explains most counts; -1 when none is identified
+    confidence: jax.Array  # [] probability that it is present, or of background only when none is identified
     posterior: jax.Array  # [N] probability that each nuclide is present
-    none: jax.Array  # [] probability of background alone
-    unknown: jax.Array  # [] probability of a source of which only scattered photons are seen
+    none: jax.Array  # [] probability of background only
+    unknown: jax.Array  # [] probability of a source of which only scattered photons are detected
     strength_cps: jax.Array  # [N] counts per second of each nuclide under the best hypothesis
-    fit: jax.Array  # [channels] counts that the best hypothesis expects
+    fit: jax.Array  # [channels] expected counts of the best hypothesis
 
 
 def hypotheses(nuclides: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nuclides [H, N] of each hypothesis, whether it has continua [H], and the logarithm of its prior [H].
 
-    The first is background alone, the second the unknown source, then each nuclide and each pair.
+    The first is background only, the second the unknown source, then each nuclide and each pair.
     """
     single, pairs = [(n,) for n in range(nuclides)], list(itertools.combinations(range(nuclides), 2))
     sets: list[tuple[int, ...]] = [(), (), *single, *pairs]
@@ -79,8 +79,8 @@ def templates(detector: Detector) -> jax.Array:
 def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identification:
     """Identify the nuclides in ``counts`` [channels] accumulated over ``live_s`` [] seconds.
 
-    With no counts or no live time the posterior is the prior. The answer holds for the nuclides that the detector
-    has tables for, and for at most two of them at once.
+    With no counts or no live time the posterior is the prior. Only nuclides for which the detector has tables are
+    considered, and at most two of them at once.
     """
     nuclides = len(detector.nuclide_names)
     members, continua, log_prior = hypotheses(nuclides)
@@ -136,9 +136,9 @@ def _fit(shape: jax.Array, data: jax.Array, allowed: np.ndarray, background: jax
 
 
 def _log_occam(strength: jax.Array, information: jax.Array, scale: jax.Array) -> jax.Array:
-    """Logarithm of the prior mass that the data leave to a strength: half-Cauchy prior of ``scale`` (counts).
+    """Logarithm of the Occam factor of a strength (counts) with a half-Cauchy prior of ``scale``.
 
-    Laplace's approximation about the fitted strength, cut at zero.
+    Laplace approximation about the fitted strength, truncated at zero.
     """
     density = 2.0 / (jnp.pi * scale * (1.0 + (strength / scale) ** 2))
     width = jnp.sqrt(2.0 * jnp.pi / (information + (0.5 / scale) ** 2))

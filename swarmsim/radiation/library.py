@@ -1,4 +1,4 @@
-"""All nuclides and materials that the configuration folders hold, and their interpolated tables (host side)."""
+"""The nuclides and materials of the configuration folders, and interpolation of their tables (host side)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ T = TypeVar("T", Nuclide, Material)
 
 @dataclass(frozen=True)
 class Library:
-    """Nuclides and materials in the order of their names; this order is that of every table and index."""
+    """Nuclides and materials sorted by name, which is the order of every table and index."""
 
     nuclides: tuple[Nuclide, ...]
     materials: tuple[Material, ...]
@@ -64,8 +64,7 @@ def _named(name: str, items: tuple[T, ...], names: tuple[str, ...], kind: str) -
 def load_library(near: Path | None = None) -> Library:
     """Read every nuclide and material of the configuration folders (`swarmsim.config.files.config_dirs`).
 
-    ``near`` is a file whose own ``configs`` folder counts too. Raises `InputError` with everything that is wrong in any
-    of the files.
+    ``near`` is a file whose own ``configs`` folder is searched too. Raises `InputError` with the problems of all files.
     """
     nuclides = tuple(load_all("nuclides", near).values())
     materials = tuple(load_all("materials", near).values())
@@ -79,7 +78,7 @@ def load_library(near: Path | None = None) -> Library:
 def mass_attenuation(material: Material, energy_kev: ArrayLike) -> Floats:
     """Mass attenuation coefficient [cm2/g] at ``energy_kev`` [...], log-log between the table's points.
 
-    An energy that stands twice is an absorption edge and is not smoothed over. Raises `InputError` outside the table.
+    An energy that is listed twice is an absorption edge, and the step is kept. Raises `InputError` outside the table.
     """
     energy, table = np.asarray(energy_kev, np.float64), np.asarray(material.energy_kev)
     if np.any(energy < table[0]) or np.any(energy > table[-1]):

@@ -1,8 +1,9 @@
-"""Count rate of one detector from one point source, dead time, and the counts that are drawn (device side).
+"""Count rate of one detector from one point source, dead time, and drawn counts (device side).
 
     rate = sum over lines of  A y A_eff(E, theta) Omega/(4 pi S) exp(-sum mu_k x_k) B(E)
 
-with A the activity, S the crystal's silhouette and A_eff the silhouette weighted with the chance to be counted.
+with activity A, silhouette S of the crystal, and effective area A_eff, the integral of the detection probability over
+the silhouette.
 """
 
 import jax
@@ -16,13 +17,13 @@ from swarmsim.radiation.library import BUILD_UP_SCALE
 def line_rates(
     detector: Detector, source: Source, lengths_m: jax.Array, position_m: jax.Array, axis: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts per second [L] of each line by photons that come unscattered, and [L] by those that come scattered.
+    """Counts per second [L] of each line from unscattered photons, and [L] from scattered ones.
 
     ``lengths_m`` [M] is the path through each material, ``position_m`` [3] the crystal's centre and ``axis`` [3] its
-    unit axis, world ENU. Layers build up together: with t_k the optical depth of layer k, the build-up is that of depth
-    sum(t_k) with C, D and P averaged over the layers with weights t_k. For a single material that is its own
-    build-up; the order of layers does not count, which only their lengths could not tell either. Scattered photons
-    are counted with the efficiency and the direction of their line.
+    unit axis, world ENU. The build-up of several layers with optical depths t_k is that of the depth sum(t_k), with
+    C, D and P averaged over the layers with weights t_k. For a single material that is its own build-up. The order of
+    the layers is not known from their lengths and has no effect. Scattered photons are counted with the efficiency and
+    the direction of their line.
     """
     direct, scattered = transmission(detector.transport_1_m[source.nuclide] @ lengths_m)
     seen = _seen(detector, source, position_m, axis)
@@ -30,7 +31,7 @@ def line_rates(
 
 
 def transmission(optical: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Unscattered and scattered photons [..., L] behind matter, per photon without it.
+    """Unscattered and scattered photons [..., L] behind matter, relative to the photons without it.
 
     ``optical`` [..., 4, L] is the optical depth t and t C, t D, t P: t exp(-t) C (1 + t / 0.2)^P exp(D t) scattered.
     """
@@ -40,12 +41,12 @@ def transmission(optical: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _seen(detector: Detector, source: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
-    """Counts per second of each line [L] with nothing in between."""
+    """Counts per second of each line [L] without attenuation."""
     offset = source.position_m - position_m
     distance = jnp.sqrt(jnp.sum(offset * offset) + 1e-12)
     u = jnp.abs(jnp.dot(offset, axis)) / distance
     across = jnp.cross(offset, axis) / distance
-    s = jnp.sqrt(jnp.sum(across * across) + 1e-10)  # a gradient exists on the axis too
+    s = jnp.sqrt(jnp.sum(across * across) + 1e-10)  # keeps the gradient finite on the axis
     geometry = solid_angle_per_area(detector.radius_m, detector.length_m, distance, u, s)
     area = detector.effective_area_m2[source.nuclide] @ direction_basis(u, s)
     return (source.activity_bq * geometry) * detector.yields[source.nuclide] * area
@@ -62,7 +63,7 @@ def net_rate(
 ) -> jax.Array:
     """Counts per second [] that ``source`` adds, before dead time; see `line_rates` for the arguments.
 
-    ``uncollided`` leaves out the photons that scattered on their way (build-up 1). Differentiable in the source's
+    ``uncollided`` excludes photons that scattered before the crystal (build-up 1). Differentiable in the source's
     position and activity, the crystal's position and the lengths.
     """
     direct, scattered = line_rates(detector, source, lengths_m, position_m, axis)
@@ -70,7 +71,7 @@ def net_rate(
 
 
 def observed_rate(detector: Detector, net_cps: jax.Array) -> jax.Array:
-    """Counts per second that the electronics deliver: source and background through the dead time [...].
+    """Counts per second [...] after dead time, of source and background together.
 
     Hybrid law m = n exp(-n t_p) / (1 + n t_n) of Lee and Gardner (Applied Radiation and Isotopes 53, 2000, 731), which
     is the paralyzable law for t_n = 0, the non-paralyzable one for t_p = 0, and no dead time when both are 0.
@@ -82,10 +83,10 @@ def observed_rate(detector: Detector, net_cps: jax.Array) -> jax.Array:
 def draw_counts(
     detector: Detector, key: jax.Array, mean_observed_cps: jax.Array, live_s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts of one measurement and the seconds that they stand for, both [...].
+    """Counts of one measurement and the exposure in s that they represent, both [...].
 
-    ``physical``: Poisson counts of the live interval ``live_s``. ``paper_ideal``: as the Gazebo plugin, Poisson(rate)
-    at every message, which stands for one second however often messages come.
+    ``physical``: Poisson counts over the live time ``live_s``. ``paper_ideal``: as the Gazebo plugin, Poisson(rate) for
+    every message, which represents one second whatever the message rate.
     """
     exposure = jnp.asarray(live_s, jnp.float32) if detector.kind == "physical" else jnp.ones_like(mean_observed_cps)
     exposure = jnp.broadcast_to(exposure, jnp.shape(mean_observed_cps))

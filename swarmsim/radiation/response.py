@@ -1,4 +1,4 @@
-"""Pulse-height spectra of a scintillator: what one photon energy, or the background, looks like (host side)."""
+"""Pulse-height spectra of a scintillator for photon energies and for the background (host side)."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,9 @@ Floats = NDArray[np.float64]
 
 REFERENCE_KEV = 661.66
 SIGMA_PER_FWHM = 1 / 2.354820045
-_STEP_KEV = 3.0  # of the grid on which continua are made before they are blurred
+_STEP_KEV = 3.0  # grid of deposited energies, before the finite resolution is applied
 # Shares of the continuum below a full-energy peak, estimates for a crystal of 1.5 to 2 inches on a light vehicle:
-_BACKSCATTER_SHARE = 0.08  # photons turned back by what surrounds the crystal
+_BACKSCATTER_SHARE = 0.08  # photons backscattered by the surroundings of the crystal
 _MULTIPLE_SHARE = 0.12  # several Compton events in the crystal, between the edge and the peak
 
 
@@ -53,7 +53,7 @@ class Response:
         return np.interp(np.log(energy_kev), np.log(self.efficiency_kev), self.efficiency_factor)
 
     def housing_transmission(self, energy_kev: Floats) -> Floats:
-        """Photons that cross the housing unscattered."""
+        """Share of the photons that cross the housing unscattered."""
         return np.exp(-linear_attenuation(self.housing, energy_kev) * self.housing_thickness_m)
 
     def end_on_efficiency(self, energy_kev: Floats) -> Floats:
@@ -90,15 +90,16 @@ def build_response(spec: Detector, crystal: Material, housing: Material) -> Resp
 
 
 def compton_edge_kev(energy_kev: Floats) -> Floats:
-    """Largest energy that one Compton event leaves in the crystal: E 2k / (1 + 2k), k = E / 511 keV."""
+    """Largest energy deposited by one Compton event: E 2k / (1 + 2k), k = E / 511 keV."""
     k = energy_kev / ELECTRON_KEV
     return energy_kev * 2 * k / (1 + 2 * k)
 
 
 def compton_recoil(energy_kev: float, recoil_kev: Floats) -> Floats:
-    """Klein-Nishina distribution of the recoil energy [t], up to a factor; 0 beyond the Compton edge.
+    """Klein-Nishina distribution of the recoil energy [t], unnormalised; 0 beyond the Compton edge.
 
-    The Klein-Nishina law in terms of s = T / E instead of the angle (`swarmsim.radiation.build_up.klein_nishina`).
+    The Klein-Nishina formula (Knoll, Radiation Detection and Measurement, 4th ed., section 2.III) in terms of
+    s = T / E instead of the angle.
     """
     k = energy_kev / ELECTRON_KEV
     inside = (recoil_kev > 0) & (recoil_kev < compton_edge_kev(np.array(energy_kev)))
@@ -108,7 +109,7 @@ def compton_recoil(energy_kev: float, recoil_kev: Floats) -> Floats:
 
 
 def _blur(response: Response, grid_kev: Floats) -> Floats:
-    """Share [grid, channels] of the pulses of each deposited energy that falls into each channel above threshold."""
+    """Share [grid, channels] of the pulses of each deposited energy in each channel above the threshold."""
     edges = (response.channel_edge_kev - grid_kev[:, None]) / response.sigma_kev(grid_kev)[:, None]
     return np.diff(ndtr(edges), axis=1) * (response.channel_centre_kev >= response.threshold_kev)
 
@@ -118,7 +119,10 @@ def _grid(response: Response) -> Floats:
 
 
 def _continuum(response: Response, energy_kev: float, grid: Floats) -> Floats:
-    """Deposited energies below the full-energy peak [grid], sums to 1: Compton, multiple Compton, backscatter."""
+    """Distribution of deposited energies below the full-energy peak [grid]; sums to 1.
+
+    It consists of single Compton events, multiple ones, and backscatter.
+    """
     edge = float(compton_edge_kev(np.array(energy_kev)))
     above = grid >= response.threshold_kev
     single = compton_recoil(energy_kev, grid) * above
@@ -136,7 +140,7 @@ def _normalised(spectra: Floats) -> Floats:
 
 
 def peak_spectrum(response: Response, energy_kev: Floats) -> Floats:
-    """Spectra [..., channels] of the lines ``energy_kev`` [...], unscattered on their way; each sums to 1."""
+    """Spectra [..., channels] of unscattered photons of the lines ``energy_kev`` [...]; each sums to 1."""
     grid = _grid(response)
     flat, back = np.unique(energy_kev, return_inverse=True)
     share = response.photopeak_share(flat)[:, None]
@@ -146,17 +150,18 @@ def peak_spectrum(response: Response, energy_kev: Floats) -> Floats:
 
 
 def scattered_flux(energy_kev: float, grid: Floats) -> Floats:
-    """Photons per keV [grid] that scattered between source and detector, up to a factor.
+    """Photons per keV [grid] that scattered between source and detector, unnormalised.
 
-    Between the Monte Carlo spectra (`swarmsim.radiation.build_up`) of air and concrete at 1 to 2 mean free paths: flat
-    in ln(E) up to the line, with a hump at 105 keV and a fall below 50 keV where photons are absorbed.
+    A compromise between the Monte Carlo spectra of air and of concrete at 1 to 2 mean free paths
+    (``configs/materials/generate_build_up.py``): flat in ln(E) up to the line, with a maximum at 105 keV and a fall
+    below 50 keV, where photons are absorbed.
     """
     hump = 0.22 + 0.28 * np.exp(-0.5 * (np.log(grid / 105.0) / 0.5) ** 2)
     return np.where(grid < energy_kev, hump * -np.expm1(-((grid / 50.0) ** 3)) / grid, 0.0)
 
 
 def scattered_spectrum(response: Response, energy_kev: Floats) -> Floats:
-    """Spectra [..., channels] of the scattered photons that lines ``energy_kev`` [...] arrive with; each sums to 1."""
+    """Spectra [..., channels] of the scattered photons of the lines ``energy_kev`` [...]; each sums to 1."""
     grid = _grid(response)
     inside = np.flatnonzero((grid >= response.threshold_kev) & (grid <= response.crystal.energy_kev[-1]))[::2]
     photons = grid[inside]

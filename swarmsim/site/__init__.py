@@ -1,4 +1,4 @@
-"""The ground truth of a place: terrain, obstacles, materials, and rays through them."""
+"""Ground truth of a site: terrain, obstacles, materials, and path lengths of rays through them."""
 
 from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh, sample, sample_with_gradient
 from swarmsim.site.rays import path_lengths

@@ -19,16 +19,16 @@ from swarmsim.site.visual import GROUND_COLOUR, TRIANGLES_MAX, welded
 
 @dataclass(frozen=True)
 class Elevation:
-    """An elevation model in a local frame whose origin is the middle of the raster at the middle's height."""
+    """An elevation model in a local frame with its origin on the ground at the centre of the raster."""
 
     grid: Grid  # the raster's own cells; rows run south to north
     height: Floats  # [ny, nx] m; NaN where the file has no data
     colours: NDArray[np.uint8] | None  # [ny, nx, 3] of the orthophoto
-    reference: dict[str, Any]  # crs, easting_m, northing_m and elevation_m of the local origin
+    reference: dict[str, Any]  # crs; easting_m, northing_m and elevation_m of the local origin
 
 
 def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
-    """Read a GeoTIFF with square cells in a metric, north-up projection; raises `InputError` with what to do."""
+    """Read a GeoTIFF with square cells in a metric, north-up projection; raises `InputError` for any other."""
     import rasterio
 
     with warnings.catch_warnings():
@@ -62,7 +62,7 @@ def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
 
 
 def own_cell(path: Path) -> float:
-    """Edge length of a GeoTIFF's cells as its projection has it, m."""
+    """Edge length of a GeoTIFF's cells in its projection, m."""
     spec = SiteSpec(name="elevation", file=path.name, licence="-", cell_m=1.0, max_file_mb=1e6)
     return read_elevation(path, spec).grid.cell
 
@@ -93,7 +93,7 @@ def _check_raster(file: Any, path: Path) -> None:
 
 
 def _orthophoto(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Colours [ny, nx, 3] of the picture that covers the same ground, one for each cell."""
+    """Colours [ny, nx, 3] of the orthophoto, which covers the same ground, one for each cell."""
     import rasterio
 
     if not path.is_file():
@@ -124,7 +124,7 @@ def elevation_ground(model: Elevation, grid: Grid, spec: SiteSpec) -> Ground:
 
 
 def elevation_mesh(model: Elevation, grid: Grid, ground: Ground) -> VisualMesh:
-    """The ground as triangles, thinned to what a viewer turns, with the orthophoto's colours where there is one."""
+    """The ground as at most `TRIANGLES_MAX` triangles, with the colours of the orthophoto if there is one."""
     step = int(np.ceil(np.sqrt(2.0 * grid.ny * grid.nx / TRIANGLES_MAX)))
     rows, columns = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in (grid.ny, grid.nx))
     points = np.concatenate([grid.centres, ground.height[..., None]], axis=-1)[np.ix_(rows, columns)]

@@ -1,4 +1,4 @@
-"""Bare ground: which surfaces of a mesh are ground, and how high it stands in every cell."""
+"""Bare ground: which surfaces of a mesh are ground, and its height in every cell."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ from swarmsim.site.raster import Floats, Grid, faces_on, highest, lowest
 Mask = NDArray[np.bool_]
 
 SMOOTH_SLOPE = 1.2  # neighbouring cells steeper than this (50 deg) belong to different sheets
-RAISED_SHARE = 0.6  # a sheet with this share of its border above its neighbours stands on the ground
-SHEET_MAX = 0.2  # a sheet of more than this share of the site is ground whatever its border
-PIT_M2 = 4.0  # a lower sheet smaller than this is the foot of something sunk into the ground, such as a post
-THICKNESS = 0.1  # m; a surface this near to the ground is part of it
+RAISED_SHARE = 0.6  # a sheet with a larger share of its border above its neighbours is not ground
+SHEET_MAX = 0.2  # a sheet of a larger share of the site is always ground
+PIT_M2 = 4.0  # a lower sheet smaller than this is the base of something embedded in the ground, such as a post
+THICKNESS = 0.1  # m; a surface within this distance of the ground is part of it
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Ground:
     """The bare ground on a grid."""
 
     height: Floats  # [ny, nx] m, finite everywhere
-    filled: Mask  # [ny, nx] missing in the mesh within its outline, interpolated
+    filled: Mask  # [ny, nx] holes within the outline of the mesh, interpolated
     outside: Mask  # [ny, nx] beyond the outline of the mesh
 
 
@@ -35,27 +35,27 @@ def named_ground(grid: Grid, corners: Floats) -> Floats:
 
 
 def found_ground(grid: Grid, corners: Floats) -> Floats:
-    """Height [ny, nx] of the ground told from the shape alone; NaN where the mesh does not show it.
+    """Height [ny, nx] of the ground inferred from the shape alone; NaN where the mesh does not show it.
 
-    The lowest upward-facing surface of every column is cut into smooth sheets at jumps steeper than `SMOOTH_SLOPE`. A
-    sheet that stands higher than its neighbours along most of its border (a roof, a crown, a parked car in a
-    photogrammetric surface) is not ground.
+    The lowest upward-facing surface of every column is segmented into smooth sheets at jumps steeper than
+    `SMOOTH_SLOPE`. A sheet that is higher than its neighbours along most of its border (a roof, a crown, a parked car
+    in a photogrammetric surface) is not ground.
     """
     normal_up = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
     bottom = lowest(grid, faces_on(grid, corners[normal_up > 0.0]))
     both_ways = lowest(grid, faces_on(grid, corners))
     if np.isfinite(bottom).sum() < 0.5 * np.isfinite(both_ways).sum():
-        bottom = both_ways  # faces turned inside out: orientation says nothing
+        bottom = both_ways  # inverted faces: their orientation is not usable
     return np.where(_raised(bottom, grid.cell), np.nan, bottom)
 
 
 def _raised(height: Floats, cell: float) -> Mask:
-    """Cells [ny, nx] of the sheets that stand on others, or are the sunk feet of things."""
+    """Mask [ny, nx] of the sheets that lie above the ground, or that are bases embedded in it."""
     index = np.arange(height.size).reshape(height.shape)
     pairs = [(index[:, :-1], index[:, 1:]), (index[:-1], index[1:])]
     one, other = (np.concatenate([p[i].ravel() for p in pairs]) for i in (0, 1))
     flat = height.ravel()
-    jump = flat[one] - flat[other]  # NaN beside missing cells: neither smooth nor a border
+    jump = flat[one] - flat[other]  # NaN beside missing cells, which is neither smooth nor a border
     smooth = np.abs(jump) <= SMOOTH_SLOPE * cell
     links = coo_array((np.ones(int(smooth.sum()), bool), (one[smooth], other[smooth])), shape=(flat.size, flat.size))
     count, sheet = connected_components(links, directed=False)
@@ -70,9 +70,9 @@ def _raised(height: Floats, cell: float) -> Mask:
 
 
 def complete_ground(seen: Floats, covered: Mask, holes_max: float) -> Ground:
-    """Fill what is missing of the ground ``seen`` [ny, nx] (NaN = not seen).
+    """The ground ``seen`` [ny, nx] (NaN = not seen) with its missing cells interpolated.
 
-    Cells below a thing (``covered``) are expected to be missing; a hole is a missing cell inside the outline with
+    Cells below an obstacle (``covered``) are expected to be missing; a hole is a missing cell inside the outline with
     nothing above it. Raises `InputError` when more than ``holes_max`` of the ground inside the outline are holes.
     """
     missing = ~np.isfinite(seen)
@@ -97,7 +97,7 @@ def complete_ground(seen: Floats, covered: Mask, holes_max: float) -> Ground:
 
 
 def _interpolated(seen: Floats, missing: Mask, outside: Mask) -> Floats:
-    """Missing cells by linear interpolation between the cells around them; the nearest beyond the outline."""
+    """``seen`` with missing cells interpolated linearly; beyond the outline, the nearest cell's height."""
     if not missing.any():
         return seen
     nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)

@@ -1,4 +1,4 @@
-"""From a source file and a specification to the arrays of a site: terrain, surface, obstacles, clearance, cost."""
+"""Import of a source file and its specification as arrays: terrain, surface, obstacles, clearance, cost."""
 
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -12,27 +12,27 @@ from scipy import ndimage
 from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import ObstacleMaterial, SiteSpec
-from swarmsim.site import drive
+from swarmsim.site import traversability
 from swarmsim.site.elevation import elevation_ground, elevation_mesh, read_elevation
-from swarmsim.site.files import TIFF_SUFFIXES, check_file
 from swarmsim.site.ground import THICKNESS, Ground, complete_ground, found_ground, named_ground
 from swarmsim.site.meshes import Part, read_mesh
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.obstacles import Box, boxes_of, components
 from swarmsim.site.raster import Floats, Grid, faces_on, top_of_cells
+from swarmsim.site.source_files import TIFF_SUFFIXES, check_file
 from swarmsim.site.survey import survey_area
 from swarmsim.site.visual import visual_mesh
 
 Mask = NDArray[np.bool_]
 
 CELLS_MAX = 4_000_000
-AIR = "air"  # the material of what is painted on other things and needs no box
-BOXES_MAX = 1024  # every ray meets every box: the largest are kept
+AIR = "air"  # material of parts painted on others, such as windows, which get no box
+BOXES_MAX = 1024  # the largest are kept: every ray is intersected with every box
 
 
 @dataclass(frozen=True)
 class RawSite:
-    """What an import finds, in plain arrays (double precision, materials by name): the content of the cache."""
+    """Result of an import as plain arrays (double precision, materials by name); the content of the cache."""
 
     grid: Grid
     terrain: Floats  # [ny, nx] m
@@ -47,7 +47,7 @@ class RawSite:
 
 
 def build(path: Path, spec: SiteSpec) -> RawSite:
-    """Read the source file ``path`` and derive everything a site has; raises `InputError` with what to do."""
+    """Import the source file ``path``; raises `InputError` when it cannot be read as a site."""
     check_file(path, spec.max_file_mb)
     return _from_elevation(path, spec) if path.suffix.lower() in TIFF_SUFFIXES else _from_mesh(path, spec)
 
@@ -60,7 +60,7 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
     is_ground, ground, surface = _separate(parts, corners, grid, spec, path)
     boxes, names, solid, passable = _obstacles(parts, is_ground, spec)
     stopping = [box for box, free in zip(boxes, passable, strict=True) if not free]
-    clear = drive.clearance(
+    clear = traversability.clearance(
         grid, ground.height, ground.outside, corners[solid], stopping, spec.zones, spec.traversability
     )
     kept = sorted(np.argsort([-box.volume for box in boxes], kind="stable")[:BOXES_MAX])
@@ -87,7 +87,7 @@ def _from_elevation(path: Path, spec: SiteSpec) -> RawSite:
     grid = model.grid if spec.cell_m == model.grid.cell else Grid(origin, spec.cell_m, ny, nx)
     ground = elevation_ground(model, grid, spec)
     nothing = np.empty((0, 3, 3))
-    clear = drive.clearance(grid, ground.height, ground.outside, nothing, [], spec.zones, spec.traversability)
+    clear = traversability.clearance(grid, ground.height, ground.outside, nothing, [], spec.zones, spec.traversability)
     report = {"parts": [], "boxes_left_out": 0, "georeference": model.reference}
     return _finish(grid, ground, ground.height, clear, [], [], elevation_mesh(model, grid, ground), spec, report)
 
@@ -96,7 +96,7 @@ def _finish(
     grid: Grid, ground: Ground, surface: Floats, clear: Floats, boxes: list[Box], names: list[str],
     mesh: VisualMesh, spec: SiteSpec, report: dict[str, Any],
 ) -> RawSite:  # fmt: skip
-    cost = drive.cost(grid, ground.height, clear, spec.traversability)
+    cost = traversability.cost(grid, ground.height, clear, spec.traversability)
     inside = ~ground.outside
     slope = np.degrees(np.arctan(np.hypot(*np.gradient(ground.height, grid.cell))))
     report |= {
@@ -175,7 +175,7 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
 
 
 def check_cells(nx: int, ny: int, spec: SiteSpec, path: Path) -> None:
-    """Refuse a grid that is too coarse to be one or too fine to hold."""
+    """Raise `InputError` for a grid of fewer than 3 x 3 or more than `CELLS_MAX` cells."""
     if min(nx, ny) < 3 or nx * ny > CELLS_MAX:
         raise InputError.of(
             f"cells of {spec.cell_m:g} m give a grid of {nx} x {ny}", file=path, path="cell_m",
@@ -200,7 +200,7 @@ def _separate(
         ground = complete_ground(seen, np.isfinite(top), spec.holes_max)
     except InputError as error:
         raise InputError([Problem(**{**vars(problem), "file": str(path)}) for problem in error.problems]) from error
-    # Grown by a cell, so that the bilinear surface is nowhere below the true one.
+    # Dilated by one cell, so that the bilinear surface is nowhere below the true one.
     grown = ndimage.maximum_filter(np.where(np.isfinite(top), top, -np.inf), 3, mode="nearest")
     return is_ground, ground, np.maximum(ground.height, grown)
 
@@ -214,7 +214,7 @@ def _near_ground(grid: Grid, seen: Floats, corners: Floats) -> Mask:
     count = len(corners)
     touched = np.bincount(hits.triangle, minlength=count)
     away = np.bincount(hits.triangle, off, count)
-    # A slope's height changes within a cell: corners may differ from its centre's by half a cell's rise.
+    # On a slope, a corner may differ from the centre of its cell by half the rise over a cell.
     north, east = np.gradient(seen, grid.cell)
     allowance = THICKNESS + np.nan_to_num(np.hypot(north, east)).ravel() * grid.cell
     cell = grid.cell_of(corners[..., :2])
@@ -223,7 +223,7 @@ def _near_ground(grid: Grid, seen: Floats, corners: Floats) -> Mask:
 
 
 def _obstacles(parts: list[Part], is_ground: Mask, spec: SiteSpec) -> tuple[list[Box], list[str], Mask, list[bool]]:
-    """Boxes, their materials, which triangles [t] stop a rover, and which boxes do not."""
+    """Boxes, their materials, triangles [t] that stop a rover, and whether a rover can pass each box."""
     boxes: list[Box] = []
     names: list[str] = []
     passable: list[bool] = []

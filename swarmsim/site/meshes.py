@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
-NO_COLOUR = (0, 0, 0, 0)  # of a part whose file gives none; the visual mesh chooses one
+NO_COLOUR = (0, 0, 0, 0)  # a part without a colour in the file; `visual_mesh` assigns one
 
 # Rows: east, north and up in the axes of a file. COLLADA 1.4.1 (<up_axis>): right, in, up are -Y, +Z, +X for X_UP;
 # +X, +Z, +Y for Y_UP; +X, -Y, +Z for Z_UP; north is away from the viewer, against "in". glTF 2.0 is Y up.
@@ -31,7 +31,7 @@ _TO_ENU = {
 class Part:
     """One geometry with one material: a piece of a scene."""
 
-    names: tuple[str, ...]  # of the material, geometry and node; patterns are matched with these
+    names: tuple[str, ...]  # of the material, geometry and node, matched by the patterns of the specification
     vertices: Floats  # [n, 3] ENU, m
     triangles: Integers  # [t, 3]
     colours: Bytes  # [t, 4] RGBA; NO_COLOUR where the file has none
@@ -43,21 +43,21 @@ class Part:
 
 
 def read_mesh(path: Path, spec: SiteSpec) -> list[Part]:
-    """The parts of a mesh file in metres, ENU (as far as the file's axes say), with unit and up axis respected.
+    """The parts of a mesh file in metres, ENU.
 
-    COLLADA and glTF say their unit and up axis; OBJ and STL do not, and count as metres with z up. ``spec.unit_m`` and
-    ``spec.up_axis`` come first. Raises `InputError` when the file cannot be read or holds no triangles.
+    COLLADA and glTF state their unit and up axis; OBJ and STL do not, and are read as metres with z up. ``spec.unit_m``
+    and ``spec.up_axis`` take precedence. Raises `InputError` when the file cannot be read or holds no triangles.
     """
     try:
         unit, up, parts = (_read_collada if path.suffix.lower() == ".dae" else _read_with_trimesh)(path)
     except InputError:
         raise
-    except Exception as error:  # the readers raise whatever their XML, JSON and number parsers raise
+    except Exception as error:  # the readers pass on the exceptions of their XML, JSON and number parsers
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError.of(
             f"cannot be read as {path.suffix.lower()} ({reason})",
             file=path,
-            suggestion="export it anew from its program",
+            suggestion="export it again from its program",
         ) from error
     parts = [part for part in parts if len(part.triangles)]
     if not parts:
@@ -76,7 +76,7 @@ def _sound(part: Part) -> bool:
 def _read_collada(path: Path) -> tuple[float, str, list[Part]]:
     import collada
 
-    with warnings.catch_warnings():  # pycollada multiplies with numpy.matrix and sets the shape of arrays
+    with warnings.catch_warnings():  # pycollada uses numpy.matrix and assigns array shapes
         warnings.filterwarnings("ignore", "Setting the shape", DeprecationWarning)
         warnings.simplefilter("ignore", PendingDeprecationWarning)
         ignored = [collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
@@ -85,7 +85,7 @@ def _read_collada(path: Path) -> tuple[float, str, list[Part]]:
 
 def _collada_scene(scene: Any, path: Path) -> tuple[float, str, list[Part]]:
     if scene.scene is None:
-        raise InputError.of("has no <scene>", file=path, suggestion="export it anew with its scene")
+        raise InputError.of("has no <scene>", file=path, suggestion="export it again with its scene")
     parts = []
     for node in scene.scene.nodes:
         for name, geometry in _geometries(node, np.eye(4), ""):

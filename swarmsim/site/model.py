@@ -1,4 +1,4 @@
-"""The ground truth of a place: rasters, obstacles, and the host-side model that carries its visual mesh."""
+"""Ground truth of a site: device arrays (rasters, obstacles), and the host-side model with its visual mesh."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +14,7 @@ from swarmsim.pytree import pytree, static
 
 @pytree
 class Obstacles:
-    """Yaw-oriented boxes, hollow or solid. K >= 1: a box of zero size stands in where a site has none."""
+    """Yaw-oriented boxes, hollow or solid. K >= 1: a site without obstacles has one box of zero size."""
 
     centre_m: jax.Array  # [K, 3] ENU
     half_extent_m: jax.Array  # [K, 3] along the box's own axes (length, width, height)
@@ -25,13 +25,13 @@ class Obstacles:
 
 @pytree
 class Site:
-    """A place as the device code sees it. Raster rows run south to north (y), columns west to east (x)."""
+    """A site on the device. Raster rows run south to north (y), columns west to east (x)."""
 
     origin_m: jax.Array  # [2] ENU centre of cell [0, 0], the south-west one
     cell_m: jax.Array  # [] edge length of a cell
     terrain_m: jax.Array  # [ny, nx] height of the bare ground
     surface_m: jax.Array  # [ny, nx] highest surface in the cell: ground, roofs, trees
-    clearance_m: jax.Array  # [ny, nx] signed distance to what stops a rover (obstacle, zone, border); < 0 inside it
+    clearance_m: jax.Array  # [ny, nx] signed distance to the nearest obstacle, zone or border; < 0 inside
     cost: jax.Array  # [ny, nx] cost of driving one metre, >= 1; inf where a rover cannot drive
     obstacles: Obstacles
     survey_area_m: jax.Array  # [V, 2] ENU convex polygon, counter-clockwise
@@ -41,7 +41,7 @@ class Site:
 
 @dataclass(frozen=True)
 class VisualMesh:
-    """What a viewer draws: triangles with vertex colours, in the site's ENU frame."""
+    """Triangles with vertex colours for a viewer, in the site's ENU frame."""
 
     vertices_m: NDArray[np.float32]  # [n, 3] ENU
     triangles: NDArray[np.uint32]  # [t, 3] indices into vertices_m, counter-clockwise seen from outside
@@ -50,7 +50,7 @@ class VisualMesh:
 
 @dataclass(frozen=True)
 class SiteModel:
-    """A loaded site on the host: its specification, its arrays, its visual mesh and what the import found."""
+    """A loaded site on the host: specification, arrays, visual mesh, and the report of the import."""
 
     name: str
     spec: SiteSpec
@@ -65,7 +65,7 @@ def _cell(site: Site, raster: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.
     last = jnp.array([nx - 1, ny - 1], jnp.float32)
     place = (xy - site.origin_m) / site.cell_m
     clamped = jnp.clip(place, 0.0, last)
-    # The index is clipped after the conversion too: what a NaN converts to is undefined.
+    # Clip the integer as well: the conversion of a NaN is undefined.
     index = jnp.clip(clamped.astype(jnp.int32), 0, jnp.array([nx - 2, ny - 2]))
     south_west = index[..., 1] * nx + index[..., 0]
     corners = raster.reshape(-1).at[south_west[..., None] + jnp.array([0, 1, nx, nx + 1])].get(mode="promise_in_bounds")
@@ -97,3 +97,15 @@ def sample_with_gradient(raster: jax.Array, site: Site, xy: jax.Array) -> tuple[
     north = corners[..., 2] + x * east_north
     slope = jnp.stack([east_south + y * (east_north - east_south), north - south], axis=-1)
     return south + y * (north - south), jnp.where(inside, slope / site.cell_m, 0.0)
+
+
+def height_at(site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Height of the terrain [n] at ``xy`` [n, 2] (ENU, m), bilinear as `sample`, on the host."""
+    terrain = np.asarray(site.terrain_m, np.float64)
+    ny, nx = terrain.shape
+    place = np.clip((xy - np.asarray(site.origin_m)) / float(site.cell_m), 0.0, [nx - 1, ny - 1])
+    index = np.minimum(place.astype(int), [nx - 2, ny - 2])
+    (x, y), column, row = (place - index).T, index[:, 0], index[:, 1]
+    south = terrain[row, column] + x * (terrain[row, column + 1] - terrain[row, column])
+    north = terrain[row + 1, column] + x * (terrain[row + 1, column + 1] - terrain[row + 1, column])
+    return south + y * (north - south)

@@ -1,4 +1,4 @@
-"""Obstacles of a mesh as yaw-oriented boxes: connected components, split where one box would mostly hold air."""
+"""Obstacles of a mesh as yaw-oriented boxes: connected components, split where one box would be mostly empty."""
 
 import heapq
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from scipy.sparse.csgraph import connected_components
 
 from swarmsim.site.raster import Floats, Grid, Integers, edge_points, faces_on
 
-FILL_MIN = 0.75  # a box whose footprint is less filled than this is split
+FILL_MIN = 0.75  # a box with a smaller filled share of its footprint is split
 AREA_SMALL = 0.3  # m2; a smaller box is not split
 BOXES_PER_COMPONENT = 24
-FLAT_M = 1e-3  # m; what is thinner than this was drawn as a surface
-SHEET_M = 0.01  # m; thickness of a surface whose file and specification give none
-VOLUME_SMALL, HEIGHT_SMALL = 0.1, 0.3  # m3, m; a component below both is no obstacle
-STEPPED = 0.3  # a long thing whose top varies more than this share of its height is cut in two
-POINTS_MAX = 6_000  # that stand for one component
+FLAT_M = 1e-3  # m; a thinner component is a surface without thickness
+SHEET_M = 0.01  # m; thickness of a surface for which the specification gives none
+VOLUME_SMALL, HEIGHT_SMALL = 0.1, 0.3  # m3, m; a component below both is not an obstacle
+STEPPED = 0.3  # a long component whose top varies by a larger share of its height is cut in two
+POINTS_MAX = 6_000  # sampled on one component
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class Box:
 
     @property
     def volume(self) -> float:
-        """Volume of its outside, m3."""
+        """Outer volume, m3."""
         return 8.0 * self.half[0] * self.half[1] * self.half[2]
 
 
 def components(vertices: Floats, triangles: Integers) -> list[Integers]:
-    """Indices of the triangles of each connected piece; vertices nearer than 0.1 mm are one."""
+    """Indices of the triangles of each connected component; vertices that agree to 0.1 mm are merged."""
     _, merged = np.unique(np.round(vertices, 4), axis=0, return_inverse=True)
     corner = merged.reshape(-1)[triangles]
     one, other = corner[:, [0, 0]].ravel(), corner[:, [1, 2]].ravel()
@@ -48,9 +48,10 @@ def components(vertices: Floats, triangles: Integers) -> list[Integers]:
 
 
 def boxes_of(corners: Floats, wall: float | None) -> list[Box]:
-    """Boxes that stand for one connected component with triangles ``corners`` [t, 3, 3].
+    """Boxes that approximate one connected component with triangles ``corners`` [t, 3, 3].
 
-    ``wall`` is the thickness of its shell, None when it is solid. Components too small to matter give no box.
+    ``wall`` is the thickness of its shell, None when it is solid. A component below `VOLUME_SMALL` and `HEIGHT_SMALL`
+    gives no box.
     """
     low, high = corners.reshape(-1, 3).min(axis=0), corners.reshape(-1, 3).max(axis=0)
     angles = _directions(corners)
@@ -72,7 +73,7 @@ def boxes_of(corners: Floats, wall: float | None) -> list[Box]:
         for half in halves:
             heapq.heappush(clouds, (-_extent(half[:, :2], _best_axis(half[:, :2], angles)).prod(), serial, half))
             serial += 1
-    # A component cut into pieces is an open shell: its pieces are the sheets themselves, and solid.
+    # A component that was split is an open shell: its pieces are its walls, and solid.
     return [_box(cloud, wall, angles, whole=len(done) == 1) for cloud in done]
 
 
@@ -99,9 +100,9 @@ def _directions(corners: Floats) -> Floats:
 
 
 def _best_axis(xy: Floats, angles: Floats) -> Floats:
-    """Direction (cos, sin) of the smallest rectangle around ``xy`` [n, 2]; its first side is the longer one.
+    """Direction (cos, sin) of the longer side of the smallest rectangle around ``xy`` [n, 2].
 
-    The smallest rectangle has a side along the hull; the directions tried are every degree and the edges' ``angles``.
+    One of its sides lies along the convex hull; the directions tried are every degree and the edges' ``angles``.
     """
     tried = np.append(np.radians(np.arange(0.0, 90.0)), angles)
     hull = _extreme_points(xy)
@@ -136,7 +137,7 @@ def _extent(xy: Floats, axis: Floats) -> Floats:
 
 
 def _split(cloud: Floats, spacing: float, angles: Floats) -> tuple[Floats, Floats] | None:
-    """The cloud cut in two where that saves most area of boxes; None where one box does."""
+    """The cloud split in two by the cut that saves most area of boxes; None where one box suffices."""
     axis = _best_axis(cloud[:, :2], angles)
     local = _own_axes(cloud[:, :2], axis)
     extent = np.ptp(local, axis=0)
@@ -152,8 +153,9 @@ def _split(cloud: Floats, spacing: float, angles: Floats) -> tuple[Floats, Float
 
 
 def _parted(cloud: Floats, local: Floats, axis: Floats, side: int, cut: float, spacing: float) -> tuple[Floats, Floats]:
-    """The cloud on either side of a cut; where it only parts neighbouring rows of points, the emptier row is
-    drawn out to the other half, so that no gap opens between the two.
+    """The cloud on either side of a cut.
+
+    Where the cut separates adjacent rows of points, the sparser row is extended to the other half, which leaves no gap.
     """
     u = local[:, side]
     left = u <= cut
@@ -171,7 +173,7 @@ def _parted(cloud: Floats, local: Floats, axis: Floats, side: int, cut: float, s
 
 
 def _fill(local: Floats, spacing: float) -> float:
-    """Share of the rectangle around ``local`` [n, 2] whose cells hold points."""
+    """Share of the cells of the rectangle around ``local`` [n, 2] that contain points."""
     low, extent = local.min(axis=0), np.ptp(local, axis=0)
     size = np.maximum((extent / (1.5 * spacing)).astype(np.int64), 1)
     cells = np.minimum(((local - low) / extent * size).astype(np.int64), size - 1)
@@ -179,7 +181,7 @@ def _fill(local: Floats, spacing: float) -> float:
 
 
 def _stepped(along: Floats, height: Floats) -> bool:
-    """Whether the top of a long thing varies much along it, as a fence's down a slope."""
+    """Whether the top of a long component varies by more than `STEPPED` along it, as that of a fence on a slope."""
     bins = np.minimum((8.0 * (along - along.min()) / np.ptp(along)).astype(np.int64), 7)
     top, bottom = np.full(8, -np.inf), np.full(8, np.inf)
     np.maximum.at(top, bins, height)
@@ -192,7 +194,7 @@ def _stepped(along: Floats, height: Floats) -> bool:
 def _best_cut(local: Floats, side: int, spacing: float) -> tuple[float, float]:
     """Area saved by cutting across ``side`` (0 or 1) into two rectangles, and the coordinate after which to cut.
 
-    Every cut through the legs of a U saves about as much; of those, the one where most begins or ends is taken.
+    All cuts through the legs of a U save about the same area; the one where most points begin or end is taken.
     """
     order = np.argsort(local[:, side], kind="stable")
     u, v = local[order, side], local[order, 1 - side]
@@ -232,7 +234,7 @@ def _box(cloud: Floats, wall: float | None, angles: Floats, whole: bool) -> Box:
 
 
 def footprint(box: Box, grid: Grid, margin: float = 0.0) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-    """A window of the grid and which of its cell centres lie in the box's footprint grown by ``margin`` m."""
+    """A window of the grid, and which of its cell centres lie in the box's footprint dilated by ``margin`` m."""
     c, s = box.axis
     reach = (
         np.array([abs(c) * box.half[0] + abs(s) * box.half[1], abs(s) * box.half[0] + abs(c) * box.half[1]]) + margin

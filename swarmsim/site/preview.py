@@ -1,4 +1,4 @@
-"""A picture of a site's rasters, to judge an import by."""
+"""Preview of a site's rasters, to check an import by eye."""
 
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,7 @@ from swarmsim.site.model import SiteModel
 
 
 def write_preview(model: SiteModel, path: Path) -> None:
-    """Write a PNG with the ground, the height of things above it, and the cost of driving."""
+    """Write a PNG with the ground, the height of obstacles above it, and the cost of driving."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -23,7 +23,7 @@ def write_preview(model: SiteModel, path: Path) -> None:
     panels: list[tuple[str, Any, str]] = [
         ("ground [m]", ground, "terrain"),
         ("height above ground [m]", above, "viridis"),
-        ("cost of driving a metre (white: barred)", driving, "YlGn_r"),
+        ("cost of driving a metre (white: impassable)", driving, "YlGn_r"),
     ]
     figure = Figure(figsize=(15, 4.6), layout="constrained")
     FigureCanvasAgg(figure)

@@ -1,4 +1,4 @@
-"""Triangles on a grid: where their faces cross the vertical lines of a grid, and where their edges run."""
+"""Rasterisation of triangles: heights of faces at grid points, and cells crossed by edges."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-_CHUNK = 2_000_000  # candidate points handled at once: bounds the memory
+_CHUNK = 2_000_000  # candidate points per chunk; bounds the memory
 
 
 @dataclass(frozen=True)
@@ -35,17 +35,17 @@ class Grid:
         return Grid((self.origin[0] - half, self.origin[1] - half), self.cell, self.ny + 1, self.nx + 1)
 
     def refined(self, factor: int) -> "Grid":
-        """The grid with ``factor`` (odd) x ``factor`` cells in each cell; every centre stays a centre."""
+        """The grid with ``factor`` x ``factor`` cells in each cell; ``factor`` is odd, which keeps the centres."""
         shift = 0.5 * self.cell * (1.0 - 1.0 / factor)
         origin = (self.origin[0] - shift, self.origin[1] - shift)
         return Grid(origin, self.cell / factor, self.ny * factor, self.nx * factor)
 
     def place(self, xy: Floats) -> Floats:
-        """``xy`` [..., 2] in cells from the centre of cell [0, 0]."""
+        """``xy`` [..., 2] (m) in units of cells from the centre of cell [0, 0]."""
         return (xy - np.asarray(self.origin)) / self.cell
 
     def cell_of(self, xy: Floats) -> Integers:
-        """Flat index [...] of the cell that ``xy`` [..., 2] lies in; the border cell for points outside."""
+        """Flat index [...] of the cell that contains ``xy`` [..., 2] (m); the nearest cell for points outside."""
         column, row = np.moveaxis(np.rint(self.place(xy)).astype(np.int64), -1, 0)
         return np.clip(row, 0, self.ny - 1) * self.nx + np.clip(column, 0, self.nx - 1)
 
@@ -60,7 +60,7 @@ class Hits:
 
 
 def faces_on(grid: Grid, corners: Floats) -> Hits:
-    """Where the vertical lines through the grid's points meet the triangles ``corners`` [t, 3, 3] (edges included)."""
+    """Intersections of the vertical lines through the grid's points with triangles [t, 3, 3], edges included."""
     found = list(_faces(grid, corners))
     if not found:
         nothing = np.empty(0, np.int64)
@@ -136,7 +136,7 @@ def _extreme(grid: Grid, hits: Hits, empty: float, start: float, pick: np.ufunc)
 def top_of_cells(grid: Grid, corners: Floats, empty: float = np.nan) -> Floats:
     """Highest point of triangles [t, 3, 3] within each whole cell [ny, nx].
 
-    A plane within a cell is highest at a corner of the cell or on an edge of the triangle, so both are looked at.
+    The highest point of a triangle within a cell is at a corner of the cell or on an edge of the triangle.
     """
     at_corners = highest(grid.corners, faces_on(grid.corners, corners), -np.inf)
     top = np.maximum.reduce([at_corners[:-1, :-1], at_corners[:-1, 1:], at_corners[1:, :-1], at_corners[1:, 1:]])

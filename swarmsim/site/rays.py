@@ -1,29 +1,29 @@
-"""How much of each material lies between two points."""
+"""Path length through each material along a line segment."""
 
 import jax
 import jax.numpy as jnp
 
 from swarmsim.site.model import Obstacles, Site, sample
 
-GROUND_SAMPLES = 48  # points along a ray at which it is compared with the terrain
-_PARALLEL = 1e-9  # a direction component below this, in metres over the whole segment, is parallel to the slab
+GROUND_SAMPLES = 48  # points along a segment at which its height is compared with the terrain's
+_PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is parallel to the slab
 
 
 def path_lengths(site: Site, a: jax.Array, b: jax.Array, soil: jax.Array | None = None) -> jax.Array:
     """Metres [M] of the straight segment from ``a`` [3] to ``b`` [3] (ENU, m) in each of ``site.material_names``.
 
-    Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); a hollow box counts its shell alone. The
-    ground is what lies below the terrain, followed linearly between `GROUND_SAMPLES` points, so that the length is
-    continuous in both ends and differentiable almost everywhere. Where things overlap, their lengths are scaled so that
-    the sum never exceeds the distance. The rest of the distance goes to ``air`` if the table has it, and then the sum
-    equals the distance. ``soil`` [] is the fraction below the terrain where it is known already (`ground_fraction`).
+    Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
+    The length below the terrain is integrated with linear interpolation between `GROUND_SAMPLES` points, so that it is
+    continuous in both ends and differentiable almost everywhere. Where obstacles overlap, the lengths are scaled so
+    that their sum does not exceed the distance. The remaining distance is that through ``air`` if the table has it, and
+    then the sum equals the distance. ``soil`` [] is the fraction below the terrain (`ground_fraction`) if it is known.
     """
     direction = b - a
     squared = jnp.sum(direction * direction)
     distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
     one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
-    # a product, because as a sum it would be the dearest part
+    # Matrix product: a masked sum would dominate the cost.
     boxes = _box_fractions(site.obstacles, a, direction)
     fractions = jnp.dot(boxes, one_hot, precision=jax.lax.Precision.HIGHEST)
     soil = ground_fraction(site, a, direction) if soil is None else soil
@@ -37,9 +37,9 @@ def path_lengths(site: Site, a: jax.Array, b: jax.Array, soil: jax.Array | None 
 
 
 def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> jax.Array:
-    """Fraction [K] of the segment within the matter of each box.
+    """Fraction [K] of the segment inside the material of each box.
 
-    Written by components, so that the boxes are what is vectorised.
+    Written per component, so that the boxes are the vectorised axis.
     """
     offset = a - obstacles.centre_m
     c, s = obstacles.axis[:, 0], obstacles.axis[:, 1]
@@ -49,7 +49,7 @@ def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> 
         c * direction[1] - s * direction[0],
         jnp.broadcast_to(direction[2], c.shape),
     )
-    # A component too small to divide by is made just large enough: the slab's ends then lie far beyond the segment's.
+    # Clamp a component that is too small to divide by: the slab then extends far beyond the segment.
     inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
     middle = [-x * i for x, i in zip(start, inverse, strict=True)]
     reach = [jnp.abs(i) for i in inverse]
@@ -61,7 +61,7 @@ def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> 
 
 
 def _slab_fraction(middle: list[jax.Array], reach: list[jax.Array], half: list[jax.Array]) -> jax.Array:
-    """Fraction [K] of the segments 0 <= t <= 1 within boxes, whose slabs are entered at middle -/+ reach half."""
+    """Fraction [K] of the segments 0 <= t <= 1 inside boxes with slabs at middle -/+ reach half."""
     enter = [m - r * h for m, r, h in zip(middle, reach, half, strict=True)]
     leave = [m + r * h for m, r, h in zip(middle, reach, half, strict=True)]
     first = jnp.maximum(jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2]), 0.0)
@@ -74,7 +74,7 @@ def ground_fraction(site: Site, a: jax.Array, direction: jax.Array) -> jax.Array
     points = a + jnp.linspace(0.0, 1.0, GROUND_SAMPLES)[:, None] * direction
     depth = sample(site.terrain_m, site, points[:, :2]) - points[:, 2]
     below = jnp.maximum(depth, 0.0)
-    # Between two samples the depth is linear: the part below is g+ / (g+ + g-), or all, or nothing.
+    # The depth is linear between two samples: the share below is g+ / (g+ + g-), all, or none.
     span = jnp.abs(depth[:-1]) + jnp.abs(depth[1:])
     part = jnp.where(span > 0.0, (below[:-1] + below[1:]) / jnp.where(span > 0.0, span, 1.0), 0.0)
     return jnp.sum(part) / (GROUND_SAMPLES - 1)

@@ -1,4 +1,4 @@
-"""Sites on disk: loading one by its name, the cache of what an import found, and importing a stranger's file."""
+"""Sites on disk: loading a site by its name, the cache of import results, and importing a user's file as a site."""
 
 import contextlib
 import hashlib
@@ -9,6 +9,7 @@ import tempfile
 import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +17,22 @@ import jax.numpy as jnp
 import numpy as np
 import platformdirs
 
+from swarmsim.atomic_folder import atomic_folder
 from swarmsim.config.documents import dump_yaml
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.files import available, find
 from swarmsim.config.load import load_model, load_named
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import SiteSpec
-from swarmsim.site.files import MAX_FILE_MB, check_file
 from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
+from swarmsim.site.source_files import MAX_FILE_MB, check_file
 
 Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What a user may say when importing a file: any field of `SiteSpec` but its file, and how to write."""
+    """Options of `import_site`: the fields of `SiteSpec` other than its file, and what to write."""
 
     name: str | None = None  # of the site; the output folder's by default
     licence: str = "not stated"
@@ -44,8 +46,9 @@ def load_site(name_or_path: str | Path, material_names: Sequence[str]) -> SiteMo
     """The site of that name in ``configs/sites``, or of that folder or ``site.yaml``.
 
     ``material_names`` is the order of the materials table, to which the obstacles' indices refer. The source file named
-    in the specification is imported, and the result kept in the user's cache folder under the hash of file,
-    specification and importer; a damaged entry is made anew. Raises `InputError` with what to do.
+    in the specification is imported, and the result is cached in the user's cache folder under a hash of the file, the
+    specification and the importer's code; a damaged entry is rebuilt. Raises `InputError` for a site that cannot be
+    loaded.
     """
     path = find("sites", name_or_path)
     spec: SiteSpec = load_named("sites", path)
@@ -72,22 +75,22 @@ def _check_materials(spec: SiteSpec, known: Sequence[str], path: Path) -> None:
 
 
 def cache_folder() -> Path:
-    """Where imported sites are kept: ``$XDG_CACHE_HOME/swarmsim/sites`` or the platform's own."""
+    """Cache folder of imported sites: ``$XDG_CACHE_HOME/swarmsim/sites``, or the platform's equivalent."""
     return Path(platformdirs.user_cache_dir("swarmsim", appauthor=False)) / "sites"
 
 
 def _arrays(spec: SiteSpec, site_file: Path) -> Arrays:
-    """What the import of a site finds, from the cache when it is there and sound."""
+    """The import result of a site, from the cache when there is a valid entry."""
     source = site_file.parent / spec.file
     check_file(source, spec.max_file_mb)
     entry = cache_folder() / f"{spec.name}-{_key(spec, source)}.npz"
     damaged = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
     with contextlib.suppress(*damaged), entry.open("rb") as file, np.load(file) as arrays:
-        return _sound(dict(arrays))
+        return _checked(dict(arrays))
     from swarmsim.site.importer import build
 
     fresh = _pack(build(source, spec))
-    with contextlib.suppress(OSError):  # a folder that cannot be written costs time, not the result
+    with contextlib.suppress(OSError):  # a cache that cannot be written only costs time
         entry.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as beside:
             np.savez(beside, allow_pickle=False, **fresh)
@@ -96,7 +99,7 @@ def _arrays(spec: SiteSpec, site_file: Path) -> Arrays:
 
 
 def _key(spec: SiteSpec, source: Path) -> str:
-    """Hash of everything that the import depends on: file, orthophoto, specification and the importer's own code."""
+    """Hash of everything that the import depends on: file, orthophoto, specification and the importer's code."""
     digest = hashlib.sha256(spec.model_dump_json().encode())
     files = [source] + ([source.parent / spec.orthophoto] if spec.orthophoto else [])
     for file in [*files, *sorted(Path(__file__).parent.glob("*.py"))]:
@@ -123,8 +126,8 @@ def _pack(raw: Any) -> Arrays:
     }
 
 
-def _sound(arrays: Arrays) -> Arrays:
-    """The arrays of a cache entry; raises `KeyError` or `ValueError` when they cannot be a site's."""
+def _checked(arrays: Arrays) -> Arrays:
+    """The arrays of a cache entry; raises `KeyError` or `ValueError` when they are not those of a site."""
     shapes = {arrays[key].shape for key in ("terrain", "surface", "clearance", "cost")}
     complete = {"grid", "boxes", "box_materials", "survey_area", "vertices", "triangles", "colours", "report"}
     if len(shapes) != 1 or not complete <= arrays.keys() or not np.isfinite(arrays["terrain"]).all():
@@ -168,55 +171,52 @@ def import_site(
     options: ImportOptions | None = None,
     material_names: Sequence[str] | None = None,
 ) -> SiteModel:
-    """Turn a mesh or an elevation model into a site: copy it to ``out_dir`` with a ``site.yaml`` and a preview.
+    """Make a site of a mesh or an elevation model: copy it to ``out_dir`` with a ``site.yaml`` and a preview.
 
-    ``material_names`` is the order of the materials table; the materials that the configuration knows by default.
-    The folder is complete or absent: it is written beside its place and renamed. Raises `InputError` when the file
-    cannot be a site or ``out_dir`` exists and ``options.overwrite`` is not set.
+    ``material_names`` is the order of the materials table, by default that of the configured materials. ``out_dir`` is
+    complete or absent. Raises `InputError` when the file cannot be read as a site, or when ``out_dir`` exists and
+    ``options.overwrite`` is not set or it is not a site.
     """
     options = options or ImportOptions()
     material_names = list(available("materials")) if material_names is None else material_names
     source, out = Path(file), Path(out_dir)
     check_file(source, float((options.fields or {}).get("max_file_mb", MAX_FILE_MB)))
-    if out.exists() and not options.overwrite:
+    data = _specification(source, out, options)
+    with atomic_folder(out, partial(_check_out, overwrite=options.overwrite)) as folder:
+        try:
+            model = _make(folder, source, data, material_names)
+        except InputError as error:
+            raise InputError([_with_user_file(p, folder, out, source) for p in error.problems]) from error
+        if options.preview:
+            from swarmsim.site.preview import write_preview
+
+            write_preview(model, folder / "preview.png")
+    return model
+
+
+def _check_out(out: Path, overwrite: bool) -> None:
+    if out.exists() and not overwrite:
         raise InputError.of("there is something already", file=out, suggestion="choose another folder, or overwrite it")
     if out.exists() and not (out / "site.yaml").is_file():
         raise InputError.of(
             "is not a site, so it will not be overwritten", file=out, suggestion="choose another folder"
         )
-    data = _specification(source, out, options)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}-") as work:
-        made = Path(work) / out.name
-        try:
-            model = _make(made, source, data, material_names)
-        except InputError as error:
-            raise InputError([_seen_from_outside(p, Path(work), out, source) for p in error.problems]) from error
-        if options.preview:
-            from swarmsim.site.preview import write_preview
-
-            write_preview(model, made / "preview.png")
-        if out.exists():
-            out.rename(Path(work) / "replaced")
-        made.rename(out)
-    return model
 
 
-def _make(made: Path, source: Path, data: dict[str, Any], material_names: Sequence[str]) -> SiteModel:
-    """Write a site's specification and files into the new folder ``made``, and load it."""
-    made.mkdir()
-    (made / "site.yaml").write_text(dump_yaml(data), encoding="utf-8")
-    spec: SiteSpec = load_model(made / "site.yaml", SiteSpec)
-    _check_materials(spec, material_names, made / "site.yaml")
-    shutil.copyfile(source, made / spec.file)
+def _make(folder: Path, source: Path, data: dict[str, Any], material_names: Sequence[str]) -> SiteModel:
+    """Write a site's specification and files into the empty ``folder``, and load it."""
+    (folder / "site.yaml").write_text(dump_yaml(data), encoding="utf-8")
+    spec: SiteSpec = load_model(folder / "site.yaml", SiteSpec)
+    _check_materials(spec, material_names, folder / "site.yaml")
+    shutil.copyfile(source, folder / spec.file)
     if spec.orthophoto is not None:
-        shutil.copyfile(source.parent / spec.orthophoto, made / spec.orthophoto)
-    return _model(spec, _arrays(spec, made / "site.yaml"), material_names)
+        shutil.copyfile(source.parent / spec.orthophoto, folder / spec.orthophoto)
+    return _model(spec, _arrays(spec, folder / "site.yaml"), material_names)
 
 
-def _seen_from_outside(problem: Problem, work: Path, out: Path, source: Path) -> Problem:
-    """A problem that names the user's files, not the folder in which the site was being made."""
-    if problem.file is None or work.name not in problem.file:
+def _with_user_file(problem: Problem, folder: Path, out: Path, source: Path) -> Problem:
+    """``problem`` with the user's file in place of its copy in the temporary ``folder``."""
+    if problem.file is None or Path(problem.file).resolve().parent != folder.resolve():
         return problem
     name = Path(problem.file).name
     return replace(problem, file=str(source if name == source.name else out / name), line=None)

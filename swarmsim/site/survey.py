@@ -1,4 +1,4 @@
-"""The area to survey: the polygon of the specification, or the site's own outline."""
+"""The survey area: the polygon of the specification, or by default the convex hull of the site."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,13 @@ VERTICES_MAX = 32
 
 
 def survey_area(grid: Grid, inside: NDArray[np.bool_], spec: SiteSpec) -> Floats:
-    """Convex polygon [v, 2], counter-clockwise: as given, or the hull of the cells ``inside``, a metre
-    or a cell within the outline."""
+    """Convex polygon [v, 2] in m, ENU, counter-clockwise.
+
+    It is the specification's, or else the convex hull of the cells ``inside`` [ny, nx], inset by one metre or one cell,
+    whichever is larger. Raises `InputError` when the specification's reaches beyond the site.
+    """
     if spec.survey_area_m is not None:
-        return _given(grid, np.array(spec.survey_area_m))
+        return _inside_site(grid, np.array(spec.survey_area_m))
     inset = max(1.0, grid.cell)
     depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * grid.cell
     core = depth > inset if (depth > inset).any() else inside
@@ -48,16 +51,8 @@ def _hull(points: Floats) -> Floats:
     return np.array(chain(ordered) + chain(ordered[::-1]))
 
 
-def _given(grid: Grid, polygon: Floats) -> Floats:
-    edge = np.roll(polygon, -1, axis=0) - polygon
-    after = np.roll(edge, -1, axis=0)
-    turn = edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]
-    once_round = np.abs(np.sum(np.angle((after[:, 0] + 1j * after[:, 1]) / (edge[:, 0] + 1j * edge[:, 1])))) < 6.3
-    if not ((turn >= 0).all() or (turn <= 0).all()) or not turn.any() or not once_round:
-        raise InputError.of(
-            "the survey area is not a convex polygon", path="survey_area_m", given=str(polygon.tolist()),
-            suggestion="give its corners in order, without dents and crossings; divide a dented area into missions",
-        )  # fmt: skip
+def _inside_site(grid: Grid, polygon: Floats) -> Floats:
+    """``polygon`` [v, 2], or `InputError` when a corner lies outside the grid."""
     low = np.array(grid.origin) - 0.5 * grid.cell
     high = low + grid.cell * np.array([grid.nx, grid.ny])
     if ((polygon < low - 1e-6) | (polygon > high + 1e-6)).any():
@@ -65,4 +60,4 @@ def _given(grid: Grid, polygon: Floats) -> Floats:
             "the survey area reaches beyond the site", path="survey_area_m", given=str(polygon.tolist()),
             allowed=f"x from {low[0]:g} to {high[0]:g} m, y from {low[1]:g} to {high[1]:g} m",
         )  # fmt: skip
-    return polygon if turn.sum() > 0 else polygon[::-1]
+    return polygon

@@ -1,4 +1,4 @@
-"""What a viewer draws of a site: one coloured mesh, thinned to a number of triangles that any viewer turns."""
+"""Visual mesh of a site: one coloured mesh, decimated to at most `TRIANGLES_MAX` triangles."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ OBSTACLE_COLOUR = (163, 158, 149, 255)  # of parts whose file gives none
 
 
 def visual_mesh(parts: list[Part], is_ground: NDArray[np.bool_], spec: SiteSpec) -> VisualMesh:
-    """The parts as one mesh; parts without a colour get an earth or a stone colour. ``is_ground`` [t] all triangles."""
+    """The parts as one mesh; those without a colour get a default. ``is_ground`` [t] covers all their triangles."""
     corners = np.concatenate([part.corners for part in parts])
     colours = np.concatenate([part.colours for part in parts]).copy()
     bare = (colours == np.array(NO_COLOUR, np.uint8)).all(axis=1)
@@ -24,7 +24,7 @@ def visual_mesh(parts: list[Part], is_ground: NDArray[np.bool_], spec: SiteSpec)
     spacing = 0.05
     points = corners
     while keep.sum() > TRIANGLES_MAX:
-        # Vertex clustering (Rossignac and Borrel, 1993): vertices of one cube of space become one.
+        # Vertex clustering (Rossignac and Borrel, 1993): the vertices in one cube are replaced by their mean.
         points = _clustered(corners.reshape(-1, 3), spacing).reshape(-1, 3, 3)
         keep = _drawn(points)
         spacing *= 1.5
@@ -40,7 +40,7 @@ def _clustered(points: Floats, spacing: float) -> Floats:
 
 
 def _drawn(corners: Floats) -> NDArray[np.bool_]:
-    """Triangles [t] that still have an area, each once."""
+    """Mask [t] of the triangles with an area, without duplicates."""
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     order = np.sort(np.round(corners, 4).view([("", corners.dtype)] * 3).reshape(-1, 3), axis=1)
     _, first = np.unique(order.view(np.float64).reshape(len(corners), 9), axis=0, return_index=True)
@@ -50,7 +50,7 @@ def _drawn(corners: Floats) -> NDArray[np.bool_]:
 
 
 def welded(corners: Floats, colours: NDArray[np.uint8]) -> VisualMesh:
-    """Triangles [t, 3, 3] with colours [t, 4] as a mesh in which corners of one place and colour are one vertex."""
+    """Mesh of triangles [t, 3, 3] with colours [t, 4]; corners of equal position and colour share a vertex."""
     packed = colours.astype(np.int64) @ np.array([1 << 24, 1 << 16, 1 << 8, 1])
     keyed = np.column_stack([np.round(corners.reshape(-1, 3), 4), np.repeat(packed, 3)])
     unique, index = np.unique(keyed, axis=0, return_inverse=True)

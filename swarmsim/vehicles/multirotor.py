@@ -4,6 +4,7 @@ Everything here is one vehicle in its body frame FLU (x forward, y left, z up, o
 All rotor axes point along body z.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -210,20 +211,29 @@ def battery_power(
 def multirotor_mjcf(spec: Multirotor, dt: float = 0.005, *, visual: bool = True) -> str:
     """MJCF of the vehicle: one free body at its centre of mass, without contact (the feet are forces of ours).
 
-    The options switch off all that a free body has no use for; a sparse Jacobian is what MJX steps fastest here.
     ``visual`` adds arms, rotor discs and feet to look at.
     """
-    inertia = " ".join(f"{i:.9g}" for i in spec.inertia_kg_m2)
-    shapes = "\n".join(_shapes(spec)) if visual else ""
-    return f"""<mujoco model="{spec.name}">
+    return free_body_mjcf(spec.name, spec.mass_kg, spec.inertia_kg_m2, dt, _shapes(spec) if visual else ())
+
+
+def free_body_mjcf(
+    name: str, mass_kg: float, inertia_kg_m2: Sequence[float], dt: float, shapes: Sequence[str] = ()
+) -> str:
+    """MJCF of one free body with geometries ``shapes``.
+
+    The options switch off all that a free body has no use for; a sparse Jacobian is what MJX steps fastest here.
+    """
+    inertia = " ".join(f"{i:.9g}" for i in inertia_kg_m2)
+    lines = "\n".join(shapes)
+    return f"""<mujoco model="{name}">
   <option timestep="{dt:.9g}" integrator="Euler" jacobian="sparse" gravity="0 0 {-GRAVITY_M_S2}">
     <flag contact="disable" constraint="disable" eulerdamp="disable"/>
   </option>
   <worldbody>
-    <body name="{spec.name}">
+    <body name="{name}">
       <freejoint/>
-      <inertial pos="0 0 0" mass="{spec.mass_kg:.9g}" diaginertia="{inertia}"/>
-{shapes}
+      <inertial pos="0 0 0" mass="{mass_kg:.9g}" diaginertia="{inertia}"/>
+{lines}
     </body>
   </worldbody>
 </mujoco>

@@ -1,4 +1,4 @@
-"""What a four-wheel skid-steer rover is: its parameters and its MJCF, both made from the specification."""
+"""Parameters of a four-wheel skid-steer rover and its MJCF, both from the specification."""
 
 import math
 
@@ -9,14 +9,14 @@ import numpy as np
 from swarmsim.config.vehicles import SkidSteer
 from swarmsim.pytree import pytree
 from swarmsim.vehicles.rover_body import RoverBody, rover_body, steiner
+from swarmsim.vehicles.state import GRAVITY_M_S2
 
-GRAVITY_M_S2 = 9.81
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 
-# Contact of a tyre in MuJoCo's terms. MuJoCo's relaxed friction lifts what slides: at its default settings a rover that
-# turns on the spot hops, and turns at half the rate that Coulomb's law gives. It does not hop while friction x
-# SLIP_DAMPING x slip stays below load x inverse mass x (1 - IMPEDANCE) / IMPEDANCE, that is up to 0.9 m/s of slip here.
-# The stiff friction rows (FRICTION_RATIO) keep a parked rover from creeping: 2 mm/s on a slope of 15 degrees.
+# Contact of a tyre in MuJoCo's terms. MuJoCo's relaxed friction cone lifts a sliding contact: at the default settings a
+# rover that turns on the spot hops, and turns at half the rate of Coulomb's law. It does not hop while friction x
+# SLIP_DAMPING x slip stays below load x inverse mass x (1 - IMPEDANCE) / IMPEDANCE, here up to 0.9 m/s of slip. Stiff
+# friction rows (FRICTION_RATIO) keep a parked rover from creeping: 2 mm/s on a slope of 15 degrees.
 IMPEDANCE = 0.5  # solimp, constant over the depth
 FRICTION_RATIO = 100.0  # impratio
 SLIP_DAMPING_1_S = 10.0  # b of solreffriction
@@ -24,7 +24,7 @@ SLIP_DAMPING_1_S = 10.0  # b of solreffriction
 
 @pytree
 class SkidSteerParams:
-    """What a sweep may vary of a rover. Body frame FLU, origin in the centre of mass; wheels FL, FR, RL, RR."""
+    """Parameters of a rover; each can be swept. Body frame FLU, origin in the centre of mass; wheels FL, FR, RL, RR."""
 
     mass_kg: jax.Array  # [] the whole rover
     inertia_kg_m2: jax.Array  # [3, 3] the whole rover about its centre of mass
@@ -33,8 +33,9 @@ class SkidSteerParams:
     wheel_inertia_kg_m2: jax.Array  # [] one wheel about its axle
     rotor_inertia_kg_m2: jax.Array  # [] motor and gears of one wheel, as the wheel feels them
     friction: jax.Array  # [] Coulomb coefficient between tyre and ground
-    tyre_sinkage_m: jax.Array  # [] of a tyre under a quarter of the weight
-    tyre_creep_m_s: jax.Array  # [] slip at which friction has its full size (`analytic` engine)
+    contact_softness: jax.Array  # [] inverse mass of a wheel's centre (`wheel_inverse_mass`) x the rover's mass
+    contact_stiffness_1_s2: jax.Array  # [] k of the reference acceleration -b v - k d r, see `tyre_constants`
+    contact_damping_1_s: jax.Array  # [] b of the same, along the normal
     rolling_resistance: jax.Array  # [] resisting force over load
     torque_max_nm: jax.Array  # [] per wheel
     motor_time_constant_s: jax.Array  # [] lag of the torque
@@ -56,9 +57,10 @@ class SkidSteerParams:
 
 
 def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSteerParams:
-    """Parameters of ``spec``; ``body`` takes the place of the one that it describes."""
+    """Parameters of ``spec``; ``body`` replaces the body that it describes."""
     body = body or rover_body(spec)
     rear, front, right, left = body.outline_m
+    stiffness, damping = tyre_constants(spec, body)
     values = {
         "mass_kg": body.mass_kg,
         "inertia_kg_m2": body.inertia_kg_m2,
@@ -67,8 +69,9 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
         "wheel_inertia_kg_m2": body.wheel_inertia_kg_m2[0],
         "rotor_inertia_kg_m2": spec.motor.rotor_inertia_kg_m2,
         "friction": spec.wheels.friction,
-        "tyre_sinkage_m": 0.25 * body.mass_kg * GRAVITY_M_S2 / spec.wheels.stiffness_n_m,
-        "tyre_creep_m_s": tyre_creep(spec, body),
+        "contact_softness": wheel_inverse_mass(spec, body) * body.mass_kg,
+        "contact_stiffness_1_s2": stiffness,
+        "contact_damping_1_s": damping,
         "rolling_resistance": spec.wheels.rolling_resistance,
         "torque_max_nm": spec.motor.torque_max_nm,
         "motor_time_constant_s": spec.motor.time_constant_s,
@@ -100,7 +103,7 @@ def wheel_spacing(wheel_position_m: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def effective_track(wheel_position_m: jax.Array) -> jax.Array:
-    """Track [] (m) of the differential-drive robot that turns as the rover does while its tyres slip.
+    """Track [] (m) of the differential-drive robot that turns at the same rate as the slipping rover.
 
     A skid-steer robot turns about centres of rotation of its left and right treads that lie outside them (Martinez et
     al., Int. J. Robotics Research 24(10), 2005; Mandow et al., IROS 2007). Their distance follows from the balance of
@@ -113,13 +116,25 @@ def effective_track(wheel_position_m: jax.Array) -> jax.Array:
 
 
 def turning_force(params: SkidSteerParams, load_n: jax.Array) -> jax.Array:
-    """Force [] (N) along the wheels, all four together, that keeps a rover of weight ``load_n`` turning (see above)."""
+    """Total force [] (N) along the wheels that keeps a rover of weight ``load_n`` [] turning, see `effective_track`."""
     base, track = wheel_spacing(params.wheel_position_m)
     return params.friction * load_n * base * jax.lax.rsqrt(base * base + track * track)
 
 
+def tyre_sinkage(params: SkidSteerParams) -> jax.Array:
+    """Depth [] (m) of a tyre in the ground under a quarter of the weight: load over D k d (`tyre_constants`)."""
+    load_per_mass = 0.25 * params.gravity_m_s2 * params.contact_softness * (1.0 - IMPEDANCE) / IMPEDANCE
+    return load_per_mass / (params.contact_stiffness_1_s2 * IMPEDANCE)
+
+
+def tyre_creep(params: SkidSteerParams) -> jax.Array:
+    """Slip [] (m/s) at which MuJoCo's regularised friction under a quarter of the weight is fully developed."""
+    load_per_mass = 0.25 * params.gravity_m_s2 * params.contact_softness * (1.0 - IMPEDANCE) / IMPEDANCE
+    return params.friction * load_per_mass / (FRICTION_RATIO * SLIP_DAMPING_1_S)
+
+
 def wheel_inverse_mass(spec: SkidSteer, body: RoverBody) -> float:
-    """How much a wheel's centre accelerates per force (1/kg), mean over directions: MuJoCo's body_invweight0."""
+    """Acceleration of a wheel's centre per force (1/kg), mean over directions: MuJoCo's body_invweight0."""
     axle = body.wheel_inertia_kg_m2[0]
     mass = np.zeros((10, 10))
     mass[:3, :3], mass[3:6, 3:6] = body.mass_kg * np.eye(3), body.inertia_kg_m2
@@ -131,21 +146,14 @@ def wheel_inverse_mass(spec: SkidSteer, body: RoverBody) -> float:
 
 
 def tyre_constants(spec: SkidSteer, body: RoverBody) -> tuple[float, float]:
-    """Stiffness k (1/s^2) and damping b (1/s) of MuJoCo's reference acceleration -b v - k r for the tyre of ``spec``.
+    """Stiffness k (1/s^2) and damping b (1/s) of MuJoCo's reference acceleration -b v - k d r for the tyre of ``spec``.
 
-    At depth r its force is D k d r with the impedance d and D = d / (1 - d) / inverse mass; D also moves with the rover
-    as added mass.
+    At depth r the force is D k d r with the impedance d and D = d / (1 - d) / inverse mass; D also acts as added mass.
     """
     added = IMPEDANCE / (1.0 - IMPEDANCE) / wheel_inverse_mass(spec, body)
     stiffness = spec.wheels.stiffness_n_m / (added * IMPEDANCE)
     critical = 2.0 * math.sqrt(spec.wheels.stiffness_n_m * (0.25 * body.mass_kg + added))
     return stiffness, spec.wheels.damping_ratio * critical / added
-
-
-def tyre_creep(spec: SkidSteer, body: RoverBody) -> float:
-    """Slip (m/s) at which MuJoCo's regularised friction under a quarter of the weight has its full size."""
-    friction_mass = FRICTION_RATIO * IMPEDANCE / (1.0 - IMPEDANCE) / wheel_inverse_mass(spec, body)
-    return 0.25 * body.mass_kg * GRAVITY_M_S2 * spec.wheels.friction / (friction_mass * SLIP_DAMPING_1_S)
 
 
 def skid_steer_mjcf(spec: SkidSteer, body: RoverBody | None = None, time_step_s: float = 0.005) -> str:
@@ -211,7 +219,7 @@ def _chassis_inertial(body: RoverBody) -> str:
 
 
 def _text(*numbers: float) -> str:
-    """Numbers for an MJCF attribute; refuses what MuJoCo would not read."""
+    """Numbers for an MJCF attribute. Raises ValueError for non-finite ones, which MuJoCo does not read."""
     if not all(math.isfinite(number) for number in numbers):
         raise ValueError(f"a body needs finite numbers, not {numbers}")
     return " ".join(f"{number:.9g}" for number in numbers)

@@ -38,7 +38,7 @@ description: Three UAVs map the radiation of a two-hectare site, a rover drives 
 site: works_yard
 seed: 0
 engine: mjx
-time_step_s: 0.005
+timing: {control_period_s: 0.01, physics_steps: 2}
 detection: physical
 sources:
   - {nuclide: Co-60, position_m: [12.0, 4.0], height_m: 1.0, activity_mbq: 170.0}
@@ -48,6 +48,36 @@ vehicles:
   - {name: uav3, type: tarot_t650, position_m: [-60.0, 35.0], heading_deg: 0.0}
   - {name: orpheus, type: orpheus, position_m: [-62.0, -10.0], heading_deg: 0.0}
 wind: {speed_m_s: 2.0, from_deg: 240.0, gusts: true}
+mapping: {cell_m: 2.0, length_scale_m: 6.0, hotspots_max: 4, hotspot_separation_m: 15.0, significance_sigma: 5.0}
+localisation:
+  presumed_nuclide: Co-60
+  presumed_height_m: 0.5
+  height_std_m: 0.5
+  window_s: 1.0
+  starts: 4
+  iterations: 200
+  learning_rate_m: 0.3
+identification: {spectrum_radius_m: 12.0, confidence_min: 0.9}
+phases:
+  - name: survey
+    who: [uav1, uav2, uav3]
+    policy: parallel_lines
+    settings:
+      altitude_m: 20.0
+      speed_m_s: 2.5
+      touchdown_speed_m_s: 0.5
+    time_limit_s: 600.0
+  - name: search
+    who: orpheus
+    policy: approach_and_orbit
+    settings: {speed_m_s: 0.9, standoff_m: 4.0, viewpoints: 8}
+    start: {after: survey}
+    time_limit_s: 600.0
+"""
+
+# The same mission as it was written before missions had phases.
+FORMER_SECTIONS = """\
+time_step_s: 0.005
 aerial:
   policy: parallel_lines
   altitude_m: 20.0
@@ -59,21 +89,12 @@ aerial:
   obstacle_clearance_m: 5.0
   separation_m: 6.0
   time_limit_s: 600.0
-mapping: {cell_m: 2.0, length_scale_m: 6.0, hotspots_max: 4, hotspot_separation_m: 15.0, significance_sigma: 5.0}
-localisation:
-  presumed_nuclide: Co-60
-  presumed_height_m: 0.5
-  height_std_m: 0.5
-  window_s: 1.0
-  starts: 4
-  iterations: 200
-  learning_rate_m: 0.3
 ground:
   policy: approach_and_orbit
   speed_m_s: 0.9
   standoff_m: 4.0
   viewpoints: 8
-  time_limit_s: 600.0
+  time_limit_s: 500.0
   spectrum_radius_m: 12.0
   confidence_min: 0.9
 """

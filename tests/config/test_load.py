@@ -1,5 +1,6 @@
 """Finding, composing and overriding configurations."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,9 @@ from swarmsim.config import files
 from swarmsim.config.documents import Mark
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.load import load_all, load_model, load_named, read_document
-from swarmsim.config.mission import Mission
+from swarmsim.config.mission import Mission, Trigger
 from swarmsim.config.names import did_you_mean, nearest
+from swarmsim.config.policies import ParallelLines, line_spacing
 from swarmsim.config.scenario import load_scenario, scenario_of
 from swarmsim.config.vehicles import Multirotor, Vehicle
 from tests.config.project import line_of, spoil
@@ -63,23 +65,48 @@ def test_names_beside_a_mission_file_are_found_from_anywhere(
 
 def test_a_mission_extends_another_deeply(mission: Path) -> None:
     child = mission.with_name("child.yaml")
-    child.write_text("extends: recon_paper\nname: child\naerial: {altitude_m: 30.0}\nsources: []\n")
+    child.write_text("extends: recon_paper\nname: child\nmapping: {cell_m: 3.0}\nsources: []\n")
     parent, loaded = load_model(mission, Mission), load_model(child, Mission)
     assert loaded.detection == "paper_ideal"
-    assert loaded.aerial == parent.aerial.model_copy(update={"altitude_m": 30.0})
+    assert loaded.mapping == parent.mapping.model_copy(update={"cell_m": 3.0})
     assert loaded.sources == ()
     assert loaded.vehicles == parent.vehicles
+
+
+def test_a_mission_changes_named_items_of_the_one_that_it_extends(mission: Path) -> None:
+    child = mission.with_name("child.yaml")
+    child.write_text(
+        "extends: recon\nname: child\n"
+        "vehicles: {uav2: {heading_deg: 90.0}}\n"
+        "phases:\n  survey: {settings: {altitude_m: 30.0}}\n  search: {time_limit_s: 300.0}\n"
+    )
+    scenario = load_scenario(child)
+    assert [member.heading_deg for member in scenario.members] == [0, 90, 0, 0]
+    assert scenario.settings[0].altitude_m == 30
+    assert scenario.settings[0].speed_m_s == 2.5
+    assert [phase.time_limit_s for phase in scenario.mission.phases] == [600, 300]
+    spoil(child, "altitude_m: 30.0", "altitude_m: 0.0")
+    spoil(child, "heading_deg: 90.0", "heading_deg: 900.0")
+    with pytest.raises(InputError) as caught:
+        load_scenario(child)
+    assert {(p.path, p.file, p.line) for p in caught.value.problems} == {
+        ("vehicles.1.heading_deg", "configs/missions/child.yaml", 3),
+        ("phases.0.settings.altitude_m", "configs/missions/child.yaml", 5),
+    }
+    spoil(child, "survey:", "surwey:")
+    with pytest.raises(InputError, match=r"child\.yaml:5 phases\.surwey: there is no item 'surwey' to change"):
+        load_scenario(child)
 
 
 def test_a_value_keeps_the_file_and_line_where_it_stands(mission: Path) -> None:
     child = mission.with_name("child.yaml")
     child.write_text("extends: recon.yaml\nname: child\n\nwind: {speed_m_s: 99}\n")
-    spoil(mission, "altitude_m: 20.0", "altitude_m: -1")
+    spoil(mission, "cell_m: 2.0", "cell_m: -1")
     with pytest.raises(InputError) as caught:
         load_model(child, Mission)
     assert {(p.path, p.file, p.line) for p in caught.value.problems} == {
         ("wind.speed_m_s", "configs/missions/child.yaml", 4),
-        ("aerial.altitude_m", "configs/missions/recon.yaml", line_of(mission, "altitude_m")),
+        ("mapping.cell_m", "configs/missions/recon.yaml", line_of(mission, "cell_m")),
     }
 
 
@@ -102,18 +129,23 @@ def test_overrides_change_values_by_field_index_and_name(mission: Path) -> None:
     changed = load_scenario(
         "recon",
         [
-            "aerial.altitude_m=30",
+            "phases.survey.settings.altitude_m=30",
             "sources.0.activity_mbq=5e1",
             "vehicles.uav2.heading_deg=90",
-            "aerial.line_spacing_m=12",
-            "aerial.area_m=[[-50, -40], [50, -40], [50, 40]]",
+            "phases.0.settings.line_spacing_m=12",
+            "phases.0.settings.area_m=[[-50, -40], [50, -40], [50, 40]]",
+            "phases.search.start={after: survey, delay_s: 5}",
             "wind.gusts=false",
         ],
         seed=7,
-    ).mission
-    assert changed.aerial.altitude_m == 30
-    assert changed.aerial.line_spacing_m == 12
-    assert changed.aerial.area_m == ((-50, -40), (50, -40), (50, 40))
+    )
+    survey = changed.settings[0]
+    assert isinstance(survey, ParallelLines)
+    assert (survey.altitude_m, line_spacing(survey)) == (30, 12)
+    assert survey.area_m == ((-50, -40), (50, -40), (50, 40))
+    changed = changed.mission
+    assert changed.phases[0].settings["altitude_m"] == 30
+    assert changed.phases[1].start == Trigger(after="survey", delay_s=5)
     assert changed.sources[0].activity_mbq == 50
     assert [member.heading_deg for member in changed.vehicles] == [0, 90, 0, 0]
     assert not changed.wind.gusts
@@ -134,8 +166,8 @@ def test_an_override_reaches_into_a_vehicle(mission: Path) -> None:
 
 
 def test_the_area_is_turned_counter_clockwise(mission: Path) -> None:
-    scenario = load_scenario("recon", ["aerial.area_m=[[0, 0], [0, 9], [9, 9], [9, 0]]"])
-    assert scenario.mission.aerial.area_m == ((9, 0), (9, 9), (0, 9), (0, 0))
+    scenario = load_scenario("recon", ["phases.survey.settings.area_m=[[0, 0], [0, 9], [9, 9], [9, 0]]"])
+    assert scenario.settings[0].area_m == ((9, 0), (9, 9), (0, 9), (0, 0))
 
 
 def test_zero_activity_and_no_sources_are_missions(mission: Path) -> None:
@@ -159,6 +191,7 @@ def test_a_scenario_written_out_is_the_same_scenario(mission: Path) -> None:
     spoil(mission.parents[1] / "vehicles" / "orpheus.yaml", "mass_kg: 51.0", "mass_kg: 61.0")
     (mission.parents[1] / "nuclides" / "Zz-1.yaml").write_text("not: valid\n")
     again = load_scenario(written)
+    assert again == replace(scenario, mission=again.mission)
     assert again.vehicles == scenario.vehicles
     assert again.detectors == scenario.detectors
     assert again.nuclides == scenario.nuclides

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from swarmsim.config.documents import dump_yaml, read_file
 from swarmsim.config.errors import InputError
 from swarmsim.config.load import load_model
 from swarmsim.config.mission import Mission
@@ -15,17 +14,22 @@ from tests.config.project import line_of, spoil
 # One edit of recon.yaml each: what is replaced, by what, and fragments of the message. "@text" stands for the place
 # ``configs/missions/recon.yaml:LINE`` of that text in the spoilt file.
 EDITS = {
-    "unknown field": ("seed: 0", "sead: 0", ["@sead", "no field 'sead'", "did you mean 'seed'", "time_step_s"]),
+    "unknown field": ("seed: 0", "sead: 0", ["@sead", "no field 'sead'", "did you mean 'seed'", "timing"]),
     "unknown nested field": (
         "  altitude_m: 20.0",
         "  altitude: 20.0",
-        ["@  altitude:", "aerial.altitude:", "did you mean 'altitude_m'", "aerial.altitude_m: this field is missing"],
+        [
+            "@  altitude:",
+            "phases.0.settings.altitude:",
+            "did you mean 'altitude_m'",
+            "phases.0.settings.altitude_m: this field is missing",
+        ],
     ),
     "missing field": ("site: works_yard\n", "", ["recon.yaml:3 site: this field is missing", "a name of letters"]),
-    "missing section": (
+    "misspelt section": (
         "mapping: {cell_m: 2.0,",
         "maping: {cell_m: 2.0,",
-        ["@maping", "did you mean 'mapping'", "mapping: this field is missing", "length_scale_m"],
+        ["@maping", "no field 'maping'", "did you mean 'mapping'"],
     ),
     "too small": ("activity_mbq: 170.0", "activity_mbq: -1", ["@- {nuclide", "given:   -1", "a number at least 0"]),
     "too large": (
@@ -45,7 +49,11 @@ EDITS = {
     "boolean for a number": ("altitude_m: 20.0", "altitude_m: true", ["is not a number", "given:   true"]),
     "not a number": ("altitude_m: 20.0", "altitude_m: .nan", ["is not a finite number", "given:   nan"]),
     "infinite": ("time_limit_s: 600.0", "time_limit_s: .inf", ["is not a finite number", "given:   inf"]),
-    "null": ("altitude_m: 20.0", "altitude_m:", ["aerial.altitude_m", "is not a number", "given:   nothing"]),
+    "null": (
+        "altitude_m: 20.0",
+        "altitude_m:",
+        ["phases.0.settings.altitude_m", "is not a number", "given:   nothing"],
+    ),
     "fraction for a count": ("starts: 4", "starts: 4.5", ["@starts", "is not a whole number", "from 1 to 64"]),
     "yes for true": ("gusts: true", "gusts: yes", ["wind.gusts", "true or false", "write true"]),
     "not a choice": ("engine: mjx", "engine: mxj", ["@engine", "one of mjx, analytic", "did you mean 'mjx'"]),
@@ -69,24 +77,24 @@ EDITS = {
         ["sources: is not a list", "at most 16 values"],
     ),
     "area of two corners": (
-        "  policy: parallel",
-        "  area_m: [[0, 0], [9, 9]]\n  policy: parallel",
-        ["aerial.area_m: has too few", "3 to 32"],
+        "      altitude_m",
+        "      area_m: [[0, 0], [9, 9]]\n      altitude_m",
+        ["phases.0.settings.area_m: has too few", "3 to 32"],
     ),
     "area on a line": (
-        "  policy: parallel",
-        "  area_m: [[0, 0], [9, 9], [18, 18]]\n  policy: parallel",
+        "      altitude_m",
+        "      area_m: [[0, 0], [9, 9], [18, 18]]\n      altitude_m",
         ["@area_m", "has no area"],
     ),
     "area with a dent": (
-        "  policy: parallel",
-        "  area_m: [[0, 0], [50, 0], [10, 10], [0, 50]]\n  policy: parallel",
-        ["aerial.area_m", "not convex"],
+        "      altitude_m",
+        "      area_m: [[0, 0], [50, 0], [10, 10], [0, 50]]\n      altitude_m",
+        ["phases.0.settings.area_m", "not convex"],
     ),
     "area that crosses itself": (
-        "  policy: parallel",
-        "  area_m: [[0, 10], [6, -8], [-9, 3], [9, 3], [-6, -8]]\n  policy: parallel",
-        ["aerial.area_m", "crosses itself"],
+        "      altitude_m",
+        "      area_m: [[0, 10], [6, -8], [-9, 3], [9, 3], [-6, -8]]\n      altitude_m",
+        ["phases.0.settings.area_m", "crosses itself"],
     ),
     "unknown site": (
         "site: works_yard",
@@ -104,32 +112,25 @@ EDITS = {
         "presumed_nuclide: cs-137",
         ["localisation.presumed_nuclide", "did you mean 'Cs-137'"],
     ),
-    "unknown aerial policy": (
-        "policy: parallel_lines",
-        "policy: paralel_lines",
-        ["@policy", "aerial policy", "did you mean 'parallel_lines'"],
-    ),
-    "unknown ground policy": (
-        "policy: approach_and_orbit",
-        "policy: orbit",
-        ["ground.policy", "ground policy 'orbit'", "approach_and_orbit"],
-    ),
-    "no UAV": ("type: tarot_t650", "type: orpheus", ["more than one rover", "vehicles.3"]),
     "same name": ("name: uav2", "name: uav1", ["vehicles.1.name", "vehicles.0 has the same name", "given:   uav1"]),
-    "same place": ("[-60.0, -5.0]", "[-60.0, -45.0]", ["vehicles.1.position_m", "'uav2' starts on top of 'uav1'"]),
+    "same place": ("[-60.0, -5.0]", "[-60.0, -45.0]", ["vehicles.1.position_m", "'uav2' starts too near to 'uav1'"]),
     "faster than the vehicle": (
         "  speed_m_s: 2.5",
         "  speed_m_s: 30",
-        ["aerial.speed_m_s", "faster than the vehicle type 'tarot_t650' can fly"],
+        ["phases.0.settings.speed_m_s", "faster than the vehicle type 'tarot_t650' can fly", "at most 8"],
     ),
-    "rover too fast": ("speed_m_s: 0.9", "speed_m_s: 4.5", ["ground.speed_m_s", "'orpheus' can drive", "at most 2"]),
+    "rover too fast": (
+        "speed_m_s: 0.9",
+        "speed_m_s: 4.5",
+        ["phases.1.settings.speed_m_s", "'orpheus' can drive", "at most 2"],
+    ),
     "no vehicle": ("vehicles:", "vehicles: []\nteam:", ["vehicles: has too few values", "no field 'team'"]),
     "twice the same field": (
         "seed: 0",
         "seed: 0\nname: other",
         ["recon.yaml:7 name: is given twice, on lines 3 and 7"],
     ),
-    "tab": ("  altitude_m", "\taltitude_m", ["@\taltitude_m", "is not valid YAML", "indent with spaces"]),
+    "tab": ("      altitude_m", "\taltitude_m", ["@\taltitude_m", "is not valid YAML", "indent with spaces"]),
     "open bracket": ("[12.0, 4.0]", "[12.0, 4.0", ["is not valid YAML", "unclosed bracket"]),
     "two colons": ("site: works_yard", "site: works: yard", ["recon.yaml:5", "is not valid YAML", "second ':'"]),
     "second document": ("seed: 0", "---\nseed: 0", ["@---", "more than one document"]),
@@ -165,18 +166,18 @@ CONTENTS = {
 }
 
 OVERRIDES = {
-    "unknown field": ("aerial.altitud_m=30", ["--set aerial.altitud_m", "did you mean 'altitude_m'"]),
-    "unknown section": ("arial.altitude_m=30", ["--set arial", "the top level has no field", "did you mean 'aerial'"]),
-    "no equals sign": ("aerial.altitude_m", ["--set: is not of the form path=value", "given:   aerial.altitude_m"]),
-    "empty step": ("aerial..altitude_m=3", ["not of the form path=value"]),
+    "unknown field": ("wind.sped_m_s=3", ["--set wind.sped_m_s", "did you mean 'speed_m_s'"]),
+    "unknown section": ("mappin.cell_m=3", ["--set mappin", "the top level has no field", "did you mean 'mapping'"]),
+    "no equals sign": ("wind.speed_m_s", ["--set: is not of the form path=value", "given:   wind.speed_m_s"]),
+    "empty step": ("wind..speed_m_s=3", ["not of the form path=value"]),
     "index too large": ("sources.3.activity_mbq=1", ["--set sources.3", "an index from 0 to 0"]),
     "unknown item": ("vehicles.uav9.heading_deg=1", ["no item 'uav9'", "uav1, uav2, uav3, orpheus"]),
     "inside a number": ("seed.x=1", ["--set seed.x", "has nothing inside"]),
     "bad value": (
-        "aerial.altitude_m=high",
-        ["--set aerial.altitude_m: is not a number", "given:   high", "at most 200"],
+        "phases.survey.settings.altitude_m=high",
+        ["--set phases.0.settings.altitude_m: is not a number", "given:   high", "at most 200"],
     ),
-    "bad YAML": ("aerial.area_m=[[1,", ["--set aerial.area_m", "is not valid YAML"]),
+    "bad YAML": ("phases.0.settings.area_m=[[1,", ["--set phases.0.settings.area_m", "is not valid YAML"]),
     "unknown name": ("site=mars", ["--set site: there is no site 'mars'"]),
     "unknown definition": (
         "definitions.vehicles.x600.mass_kg=1",
@@ -184,7 +185,7 @@ OVERRIDES = {
     ),
     "landing that is a crash": (
         "definitions.vehicles.tarot_t650.impact_speed_max_m_s=0.3",
-        ["aerial.touchdown_speed_m_s: is a crash for the vehicle type 'tarot_t650'", "at most 0.3"],
+        ["phases.0.settings.touchdown_speed_m_s: is a crash for the vehicle type 'tarot_t650'", "at most 0.3"],
     ),
     "bad definition": (
         "definitions.vehicles.x500.mass_kg=-1",
@@ -231,15 +232,15 @@ def test_everything_is_told_at_once_in_the_order_of_the_file(mission: Path) -> N
     spoil(mission, "type: tarot_t650", "type: nothing")
     spoil(mission, "altitude_m: 20.0", "altitude_m: 2O")
     with pytest.raises(InputError) as caught:
-        load_scenario(mission, ["seed=-1", "arial.x=1"])
+        load_scenario(mission, ["seed=-1", "wint.x=1"])
     problems = caught.value.problems
     places = {problem.path: (problem.file, problem.line) for problem in problems}
     file = "configs/missions/recon.yaml"
     assert places == {
-        "arial": ("--set", None),
+        "wint": ("--set", None),
         "seed": ("--set", None),
         "sources.0.activity_mbq": (file, line_of(mission, "activity_mbq")),
-        "aerial.altitude_m": (file, line_of(mission, "altitude_m")),
+        "phases.0.settings.altitude_m": (file, line_of(mission, "altitude_m")),
         "site": (file, line_of(mission, "\nsite:") + 1),
         "vehicles.0.type": (file, line_of(mission, "type: nothing")),
     }
@@ -257,26 +258,14 @@ def test_problems_of_other_files_name_those_files(mission: Path) -> None:
     assert "configs/sites/works_yard/site.yaml:4 cell_m: is not a number" in message
 
 
-def test_a_team_without_a_multirotor(mission: Path) -> None:
-    content = mission.read_text()
-    start, end = content.index("vehicles:"), content.index("wind:")
-    mission.write_text(
-        content[:start] + "vehicles:\n  - {name: r, type: orpheus, position_m: [0, 0]}\n" + content[end:]
-    )
-    message = message_of(mission)
-    assert "no multirotor" in message
-    assert "add a vehicle of a multirotor type" in message
-
-
-def test_a_vehicle_without_a_detector_or_with_an_unknown_one(mission: Path) -> None:
+def test_a_vehicle_with_an_unknown_detector(mission: Path) -> None:
     vehicles = mission.parents[1] / "vehicles"
-    spoil(vehicles / "orpheus.yaml", "model: nai_2x2", "model: nai_2x")
-    assert "a detector 'nai_2x' that does not exist" in message_of(mission)
-    bare = read_file(vehicles / "tarot_t650.yaml").data
-    del bare["detector"]
-    bare["sources"] = {key: text for key, text in bare["sources"].items() if not key.startswith("detector")}
-    (vehicles / "tarot_t650.yaml").write_text(dump_yaml(bare))
-    assert "'tarot_t650' carries no detector" in message_of(mission)
+    spoil(vehicles / "tarot_t650.yaml", "model: nai_1p5x1p5", "model: nai_1p5x1")
+    with pytest.raises(InputError) as caught:
+        load_scenario(mission)
+    assert [problem.path for problem in caught.value.problems] == ["vehicles.0.type"]
+    assert "a detector 'nai_1p5x1' that does not exist" in str(caught.value)
+    assert "did you mean 'nai_1p5x1p5'" in str(caught.value)
 
 
 def test_a_site_of_an_unknown_material(mission: Path) -> None:

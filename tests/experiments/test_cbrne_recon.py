@@ -28,7 +28,7 @@ def test_the_net_rate_above_the_source_is_that_of_the_crystal(experiment):
 
 def test_the_median_decides_whether_a_bar_is_met(experiment):
     rows = [
-        {"aerial_measurements": n, "aerial_duration_s": s}
+        {"survey_measurements": n, "survey_duration_s": s}
         for n, s in ((9_000, 300.0), (10_300, 310.0), (10_400, 400.0))
     ]
     figures = [f for f in experiment.PAPER if f.key in rows[0]]
@@ -39,7 +39,7 @@ def test_the_median_decides_whether_a_bar_is_met(experiment):
 
 
 def test_figures_name_columns_that_missions_have(experiment):
-    from swarmsim.missions.summary import batch_row
+    from swarmsim.results.summary import batch_row
     from tests.synthetic import mission
 
     row = batch_row(mission())

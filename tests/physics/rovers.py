@@ -13,14 +13,14 @@ from swarmsim.config.vehicles import SkidSteer
 from swarmsim.physics.skid_steer import make_skid_steer_step, rest_state
 from swarmsim.physics.wheels import ROLLING_ONSET_RAD_S
 from swarmsim.site import Obstacles, Site
-from swarmsim.vehicles.skid_steer import skid_steer_mjcf, skid_steer_params
+from swarmsim.vehicles.skid_steer import skid_steer_mjcf, skid_steer_params, tyre_sinkage
 
 FILE = Path(__file__).parents[2] / "configs" / "vehicles" / "orpheus.yaml"
 SPEC = SkidSteer(**yaml.safe_load(FILE.read_text()))
 PARAMS = skid_steer_params(SPEC)
 DT = 0.005
 CHUNK = 10  # steps
-STEP = {engine: make_skid_steer_step(SPEC, engine, DT) for engine in ("mjx", "analytic")}
+STEP = {engine: make_skid_steer_step(engine, DT) for engine in ("mjx", "analytic")}
 ENGINES = tuple(STEP)
 
 
@@ -83,7 +83,7 @@ def mujoco_drive(command, seconds, dt, gravity=(0.0, 0.0, -9.81)):
     model = mujoco.MjModel.from_xml_string(skid_steer_mjcf(SPEC, time_step_s=dt))
     model.opt.gravity[:] = gravity
     data = mujoco.MjData(model)
-    data.qpos[2] -= float(PARAMS.tyre_sinkage_m)
+    data.qpos[2] -= float(tyre_sinkage(PARAMS))
     p = jax.tree.map(lambda x: np.asarray(x, float), PARAMS)
     resistance = p.rolling_resistance * 0.25 * p.mass_kg * p.gravity_m_s2 * p.wheel_radius_m
     torque, command = np.zeros(4), np.asarray(command, float)

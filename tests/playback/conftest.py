@@ -2,7 +2,7 @@
 
 import pytest
 
-from swarmsim.missions.record import MissionRecord
+from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 from tests import synthetic
 
@@ -22,3 +22,9 @@ def found() -> MissionRecord:
 def nothing() -> MissionRecord:
     """A mission over a site without a source, which found none."""
     return synthetic.mission(found=False)
+
+
+@pytest.fixture(scope="session")
+def swarm() -> MissionRecord:
+    """A mission of 200 quadrotors that sought nothing."""
+    return synthetic.swarm()

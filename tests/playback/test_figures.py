@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 
-from swarmsim.missions.record import MissionRecord
 from swarmsim.playback import figures, plan
+from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 from tests import synthetic
 
@@ -62,11 +62,11 @@ def test_trajectories_show_every_track_over_the_buildings(found: MissionRecord, 
     np.testing.assert_array_equal(~np.ma.getmaskarray(shade), inside)
 
 
-def test_aerial_measurements_are_all_there_in_the_colour_of_their_rate(found: MissionRecord, site: SiteModel) -> None:
-    figure = figures.aerial_measurements(found, site)
+def test_flown_measurements_are_all_there_in_the_colour_of_their_rate(found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.flown_measurements(found.phases[0], found, site)
     check_plan(figure.axes[0])
     (dots,) = [c for c in figure.axes[0].collections if isinstance(c, PathCollection)]
-    samples = found.samples.of_phase("aerial")
+    samples = found.samples.of_phase("survey")
     np.testing.assert_allclose(np.asarray(dots.get_offsets()), samples.position_m[:, :2])
     rates = np.asarray(dots.get_array())
     expected = synthetic.rate_cps(samples.position_m)
@@ -77,25 +77,26 @@ def test_aerial_measurements_are_all_there_in_the_colour_of_their_rate(found: Mi
 def test_map_shows_truth_hotspot_and_the_ellipse_of_95_percent(found: MissionRecord, site: SiteModel) -> None:
     figure = figures.radiation_map(found, site)
     whole, close = figure.axes[:2]
+    assert found.map is not None
     for axes in (whole, close):
         check_plan(axes)
         np.testing.assert_array_equal(np.asarray(axes.images[-1].get_array()), found.map.mean_cps)
         (ellipse,) = [p for p in axes.patches if isinstance(p, Ellipse)]
-        assert found.aerial_estimate is not None
-        assert ellipse.center == pytest.approx(tuple(found.aerial_estimate.position_m[:2]))
-        variances = np.linalg.eigvalsh(found.aerial_estimate.covariance_m2[:2, :2])
+        assert found.survey_estimate is not None
+        assert ellipse.center == pytest.approx(tuple(found.survey_estimate.position_m[:2]))
+        variances = np.linalg.eigvalsh(found.survey_estimate.covariance_m2[:2, :2])
         assert ellipse.width == pytest.approx(2 * np.sqrt(5.991 * variances[1]), rel=1e-3)
         assert ellipse.height == pytest.approx(2 * np.sqrt(5.991 * variances[0]), rel=1e-3)
     assert (*whole.get_xlim(), *whole.get_ylim()) == pytest.approx((-75, 75, -60, 60))
-    assert {"hotspot", "true source", "estimate from the air, 95 % ellipse"} <= set(labels(whole))
+    assert {"hotspot", "true source", "survey estimate, 95 % ellipse"} <= set(labels(whole))
     assert "Count rate, interpolated [1/s]" in texts(figure)
     contours = [text for text in texts(figure) if text.isdigit() and 95 < int(text) < 240]
     assert len(contours) >= 2
 
 
 def test_ellipse_holds_95_percent_of_a_normal_distribution(found: MissionRecord) -> None:
-    assert found.aerial_estimate is not None
-    covariance = found.aerial_estimate.covariance_m2
+    assert found.survey_estimate is not None
+    covariance = found.survey_estimate.covariance_m2
     points = np.random.default_rng(1).multivariate_normal(np.zeros(2), covariance[:2, :2], 40_000)
     width, height, angle = plan.ellipse_95(covariance)
     turn = np.radians(angle)
@@ -104,8 +105,8 @@ def test_ellipse_holds_95_percent_of_a_normal_distribution(found: MissionRecord)
     assert np.mean((2 * along / width) ** 2 + (2 * across / height) ** 2 < 1) == pytest.approx(0.95, abs=0.005)
 
 
-def test_ground_measurements_on_a_log_scale_with_a_close_up(found: MissionRecord, site: SiteModel) -> None:
-    figure = figures.ground_measurements(found, site)
+def test_driven_measurements_on_a_log_scale_with_a_close_up(found: MissionRecord, site: SiteModel) -> None:
+    figure = figures.driven_measurements(found.phases[1], found, site)
     whole, close, bar = figure.axes
     check_plan(whole)
     check_plan(close)
@@ -115,8 +116,8 @@ def test_ground_measurements_on_a_log_scale_with_a_close_up(found: MissionRecord
     np.testing.assert_allclose(centre, found.estimate.position_m[:2])
     assert np.ptp(close.get_xlim()) == pytest.approx(20.0)
     dots = [c for c in close.collections if isinstance(c, PathCollection)]
-    assert len(dots[0].get_offsets()) == len(found.samples.of_phase("ground").time_s)
-    assert "planned route" in labels(whole)
+    assert len(dots[0].get_offsets()) == len(found.samples.of_phase("search").time_s)
+    assert "planned path" in labels(whole)
 
 
 def test_spectrum_has_its_fit_lines_and_residuals(found: MissionRecord, site: SiteModel) -> None:
@@ -135,9 +136,26 @@ def test_spectrum_has_its_fit_lines_and_residuals(found: MissionRecord, site: Si
     assert "Co-60, confidence > 0.999" in texts(figure)
 
 
-@pytest.mark.parametrize("name", list(figures.FIGURES))
+NAMES = ["trajectories", "measurements_survey", "measurements_search", "radiation_map", "spectrum"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_print_quality(name: str, found: MissionRecord, site: SiteModel) -> None:
-    figure = figures.FIGURES[name](found, site)
+    figure = figures.figures_of(found)[name](found, site)
+    check_print(figure)
+
+
+@pytest.mark.parametrize("count", [1, 12, 13])
+def test_trajectories_of_any_team_have_room_for_their_legend(count: int, site: SiteModel) -> None:
+    team = synthetic.swarm(count, 30.0)
+    figure = figures.trajectories(team, site)
+    check_print(figure)
+    named = [vehicle.name for vehicle in team.vehicles] if count <= 12 else ["13 x500"]
+    assert labels(figure.axes[0]) == [*named, "start", "obstacles"]
+
+
+def check_print(figure: Figure) -> None:
+    """A column wide, letters of a readable size, nothing cut off."""
     figure.canvas.draw()
     width = figure.get_figwidth()
     assert width in (plan.SINGLE_COLUMN_IN, plan.DOUBLE_COLUMN_IN)
@@ -153,7 +171,7 @@ def test_written_in_four_seconds_at_300_dpi(found: MissionRecord, site: SiteMode
     start = time.process_time()
     written = figures.write(found, site, tmp_path / "figures")
     assert time.process_time() - start < 4.0
-    assert [path.stem for path in written] == list(figures.FIGURES)
+    assert [path.stem for path in written] == NAMES
     for path in written:
         pixels = matplotlib.image.imread(path)
         assert pixels.shape[1] in (1050, 2148)
@@ -165,9 +183,8 @@ def test_written_in_four_seconds_at_300_dpi(found: MissionRecord, site: SiteMode
 
 
 def test_mission_without_a_source(nothing: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
-    assert len(figures.write(nothing, site, tmp_path)) == 5
-    assert "No spectrum: nothing was found to identify." in texts(figures.spectrum(nothing, site))
-    assert "no measurements\non the ground" in texts(figures.ground_measurements(nothing, site))
+    written = figures.write(nothing, site, tmp_path)
+    assert [path.stem for path in written] == ["trajectories", "measurements_survey", "radiation_map"]
     whole = figures.radiation_map(nothing, site).axes[0]
     assert labels(whole) == ["obstacles"]
     # An even map is one colour, and the same in both panels.
@@ -181,3 +198,20 @@ def test_flat_site_without_buildings_and_a_lost_vehicle(found: MissionRecord, si
     lost = dataclasses.replace(found.vehicles[0], position_m=np.full_like(found.vehicles[0].position_m, np.nan))
     record = dataclasses.replace(found, vehicles=(lost, *found.vehicles[1:]))
     assert len(figures.write(record, flat, tmp_path)) == 5
+
+
+def test_a_swarm_that_sought_nothing_has_its_trajectories_alone(
+    swarm: MissionRecord, site: SiteModel, tmp_path: Path
+) -> None:
+    assert [path.stem for path in figures.write(swarm, site, tmp_path)] == ["trajectories"]
+    axes = figures.trajectories(swarm, site).axes[0]
+    tracks = [line for line in axes.lines if line.get_linestyle() == "-" and len(np.asarray(line.get_xdata())) > 1]
+    assert len(tracks) == 200
+    assert labels(axes) == ["200 x500", "start", "obstacles"]
+
+
+def test_figures_of_phases_with_any_name(found: MissionRecord) -> None:
+    phase = dataclasses.replace(found.phases[0], name="by hand/1")
+    samples = dataclasses.replace(found.samples, phase=np.full(len(found.samples.time_s), phase.name))
+    record = dataclasses.replace(found, phases=(phase,), samples=samples)
+    assert "measurements_by_hand_1" in figures.figures_of(record)

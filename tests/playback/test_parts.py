@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarmsim.config.errors import InputError
-from swarmsim.missions.record import MissionRecord, Samples
 from swarmsim.playback import growing_map, viewer
 from swarmsim.playback.bodies import shaded, vehicle_mesh
 from swarmsim.playback.colours import linear_scale, log_scale, smoothed_rate, vehicle_colours
 from swarmsim.playback.scene_marks import ellipsoid, quaternion_of
+from swarmsim.results.record import MissionRecord, Samples
 from swarmsim.site.model import SiteModel
 from tests import synthetic
 
@@ -28,15 +28,15 @@ def test_smoothed_rate_is_the_mean_of_each_vehicles_own_second() -> None:
     vehicle = np.tile([0, 1], len(time) // 2).astype(np.int32)
     counts = np.where(vehicle == 0, 10.0, 30.0)
     exposure = np.full(len(time), 0.1)
-    phase = np.full(len(time), "aerial")
+    phase = np.full(len(time), "survey")
     samples = Samples(vehicle, phase, time, np.zeros((len(time), 3)), counts, exposure, counts / exposure)
     np.testing.assert_allclose(smoothed_rate(samples), np.where(vehicle == 0, 100.0, 300.0))
 
 
 def test_smoothed_rate_lowers_the_noise_as_poisson_says(found: MissionRecord) -> None:
-    aerial = found.samples.of_phase("aerial")
-    error = smoothed_rate(aerial) - synthetic.rate_cps(aerial.position_m)
-    raw = aerial.count_rate_cps - synthetic.rate_cps(aerial.position_m)
+    survey = found.samples.of_phase("survey")
+    error = smoothed_rate(survey) - synthetic.rate_cps(survey.position_m)
+    raw = survey.count_rate_cps - synthetic.rate_cps(survey.position_m)
     assert error.std() / raw.std() == pytest.approx(1 / np.sqrt(11), rel=0.25)
 
 
@@ -82,7 +82,7 @@ def test_shading_keeps_smooth_ground_whole_and_gives_a_box_its_edges() -> None:
 
 def test_partial_map_is_right_where_it_was_flown_and_silent_elsewhere(found: MissionRecord) -> None:
     grid = growing_map.grid_of(found.map)
-    early = found.samples.of_phase("aerial").until(60.0)
+    early = found.samples.of_phase("survey").until(60.0)
     rate, seen = growing_map.partial_map(early, grid)
     assert 0.05 < seen.mean() < 0.6
     y, x = np.nonzero(seen)

@@ -11,8 +11,8 @@ import pyarrow as pa
 import pytest
 import rerun as rr
 
-from swarmsim.missions.record import Event, MissionRecord
 from swarmsim.playback.recording import write_recording
+from swarmsim.results.record import Event, MissionRecord, Samples
 from swarmsim.site.model import SiteModel
 from tests import synthetic
 
@@ -123,7 +123,7 @@ def test_every_vehicle_has_a_solid_body_and_its_name(recording: Recording, found
 
 
 def test_every_sample_is_a_point_that_appears_when_it_was_taken(recording: Recording, found: MissionRecord) -> None:
-    for phase in ("aerial", "ground"):
+    for phase in ("survey", "search"):
         samples = found.samples.of_phase(phase)
         for index in np.unique(samples.vehicle):
             mine = samples.vehicle == index
@@ -136,8 +136,8 @@ def test_every_sample_is_a_point_that_appears_when_it_was_taken(recording: Recor
 
 
 def test_measurement_colours_follow_the_count_rate(recording: Recording, found: MissionRecord) -> None:
-    _, rows = recording.rows("/world/measurements/ground/orpheus", "Points3D:colors")
-    samples = found.samples.of_phase("ground")
+    _, rows = recording.rows("/world/measurements/search/orpheus", "Points3D:colors")
+    samples = found.samples.of_phase("search")
     colours = np.concatenate(rows).astype(np.int64)
     green = (colours >> 16) & 255  # of RGBA in one integer; green grows all along viridis
     assert np.corrcoef(green, np.log(samples.count_rate_cps))[0, 1] > 0.95
@@ -208,9 +208,9 @@ def test_truth_is_static_and_estimates_come_when_they_are_made(recording: Record
     when, (place,) = recording.rows("/world/truth/0/pin/place", "Points3D:positions")
     assert np.isnan(when).all()
     np.testing.assert_allclose(place[0], synthetic.SOURCE_M, atol=1e-4)
-    assert found.aerial_estimate is not None
+    assert found.survey_estimate is not None
     assert found.estimate is not None
-    for name, estimate, phase in (("aerial", found.aerial_estimate, 0), ("final", found.estimate, 1)):
+    for name, estimate, phase in (("survey", found.survey_estimate, 0), ("final", found.estimate, 1)):
         entity = f"/world/estimate/{name}/ellipsoid"
         when, (half_sizes,) = recording.rows(entity, "Ellipsoids3D:half_sizes")
         assert when == pytest.approx([found.phases[phase].end_s])
@@ -219,12 +219,12 @@ def test_truth_is_static_and_estimates_come_when_they_are_made(recording: Record
 
 
 def test_plots_hold_every_rate_and_the_battery_in_percent(recording: Recording, found: MissionRecord) -> None:
-    samples = found.samples.of_phase("aerial")
-    times, values = recording.rows("/plots/aerial_samples/uav1", "Scalars:scalars")
+    samples = found.samples.of_phase("survey")
+    times, values = recording.rows("/plots/samples/survey/uav1", "Scalars:scalars")
     mine = samples.vehicle == 0
     np.testing.assert_allclose(np.array(values)[:, 0], samples.count_rate_cps[mine])
     np.testing.assert_allclose(times, samples.time_s[mine], atol=1e-6)
-    _, mean = recording.rows("/plots/aerial_rate/uav1", "Scalars:scalars")
+    _, mean = recording.rows("/plots/rate/survey/uav1", "Scalars:scalars")
     assert np.std(mean) < 0.9 * np.std(values)
     _, battery = recording.rows("/plots/battery/orpheus", "Scalars:scalars")
     assert battery[0][0] == pytest.approx(100.0)
@@ -243,11 +243,18 @@ def test_spectrum_keeps_every_count_and_labels_its_lines(recording: Recording, f
 def test_log_tells_the_mission_in_order(recording: Recording, found: MissionRecord) -> None:
     times, texts = recording.rows("/log/mission", "TextLog:text")
     told = [text[0] for text in texts]
-    assert told[0] == "aerial survey begins"
-    assert any(text.startswith("uav2: landed") for text in told)
+    assert told[0] == "survey begins"
+    assert any(text.startswith("uav2: finished") for text in told)
     assert any(text.startswith("final estimate: 12.12 ± 0.14 m east") for text in told)
     assert found.finding in told
     assert (np.diff(times) >= 0).all()
+
+
+def test_planned_path_comes_with_its_phase(recording: Recording, found: MissionRecord) -> None:
+    when, (strips,) = recording.rows("/world/paths/orpheus", "LineStrips3D:strips")
+    assert when == pytest.approx([found.phases[1].start_s])
+    np.testing.assert_allclose(np.array(strips[0])[:, :2], found.paths_m[3][:, :2], atol=1e-4)
+    assert not any(entity.startswith("/world/paths/uav") for entity in recording.tables)
 
 
 def test_only_the_missions_own_timeline(recording: Recording) -> None:
@@ -267,7 +274,7 @@ def test_mission_without_a_source(nothing: MissionRecord, site: SiteModel, tmp_p
     recording = Recording(path)
     entities = set(recording.tables)
     assert not any(
-        e.startswith(("/world/estimate", "/world/truth", "/world/route", "/world/hotspots")) for e in entities
+        e.startswith(("/world/estimate", "/world/truth", "/world/paths", "/world/hotspots")) for e in entities
     )
     _, (note,) = recording.rows("/spectrum", "TextDocument:text")
     assert "nothing was found" in note[0]
@@ -295,6 +302,48 @@ def test_crash_is_an_error_in_the_log_and_a_broken_track_does_no_harm(
     assert times[at] == 100.0
     _, positions = recording.rows("/world/vehicles/uav2", "Transform3D:translation")
     assert np.isfinite(np.array(positions)).all()
+
+
+def test_a_swarm_is_small_and_all_of_it_is_drawn(swarm: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
+    path = tmp_path / "swarm.rrd"
+    write_recording(swarm, site, path)
+    assert path.stat().st_size < 10e6
+    assert verify(path).returncode == 0
+    recording = Recording(path)
+    entities = sorted(entity for entity in recording.tables if entity.startswith("/world/vehicles/"))
+    assert len(entities) == 5  # one for each colour
+    drawn = 0
+    for entity in entities:
+        times, positions = recording.rows(entity, "InstancePoses3D:translations")
+        assert np.diff(times).max() < 1.0
+        assert (times[0], times[-1]) == pytest.approx((0.0, 300.0))
+        first, last = np.array(positions[0]), np.array(positions[-1])
+        for start, end in zip(first, last, strict=True):
+            one = min(swarm.vehicles, key=lambda v: np.linalg.norm(v.position_m[0] - start))
+            np.testing.assert_allclose(start, one.position_m[0], atol=1e-3)
+            np.testing.assert_allclose(end, one.position_m[-1], atol=1e-3)
+        drawn += len(first)
+    assert drawn == 200
+    _, strips = recording.rows("/world/trails/x500_1", "LineStrips3D:strips")
+    flown = sum(np.linalg.norm(np.diff(v.position_m, axis=0), axis=1).sum() for v in swarm.vehicles[::5])
+    steps = np.concatenate([np.array(row) for row in strips])
+    assert np.linalg.norm(steps[:, 1] - steps[:, 0], axis=-1).sum() == pytest.approx(flown, rel=0.01)
+    _, least = recording.rows("/plots/battery/least", "Scalars:scalars")
+    assert least[-1][0] == pytest.approx(100.0 * min(v.battery_fraction[-1] for v in swarm.vehicles), abs=1e-3)
+    outside = ("/world/measurements", "/world/map", "/world/legend", "/spectrum", "/plots/rate")
+    assert not any(entity.startswith(outside) for entity in recording.tables)
+
+
+def test_a_large_team_measures_together_and_not_too_much(swarm: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
+    time = np.repeat(np.arange(1.0, 301.0), 400)  # 120,000 samples, each vehicle two a second
+    vehicle = np.tile(np.repeat(np.arange(200, dtype=np.int32), 2), 300)
+    counts, phase = np.full(len(time), 90.0), np.full(len(time), "cover")
+    samples = Samples(vehicle, phase, time, np.zeros((len(time), 3)), counts, np.ones_like(time), counts)
+    path = tmp_path / "counting.rrd"
+    write_recording(dataclasses.replace(swarm, samples=samples), site, path)
+    assert path.stat().st_size < 10e6
+    _, rows = Recording(path).rows("/world/measurements/cover/all", "Points3D:positions")
+    assert sum(map(len, rows)) == 60_000
 
 
 def test_awkward_names_and_no_vehicle_shape(found: MissionRecord, site: SiteModel, tmp_path: Path) -> None:

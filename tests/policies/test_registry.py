@@ -1,29 +1,245 @@
+"""Policies by name, from files, modules and entry points."""
+
+import hashlib
+import sys
+from pathlib import Path
+
 import pytest
 
-from swarmsim.policies import get, names, register
-from swarmsim.policies.registry import _policies
+from swarmsim.config.errors import InputError
+from swarmsim.config.policies import SETTINGS, PolicySettings
+from swarmsim.config.scenario import load_scenario
+from swarmsim.policies import find, names, register, registry
+from tests.config.project import make_project
+
+CLIMB = """\
+from swarmsim.config.policies import PolicySettings
 
 
-def test_shipped_policies_are_found_by_name():
-    assert "parallel_lines" in names("aerial")
-    assert "approach_and_orbit" in names("ground")
+class ClimbSettings(PolicySettings):
+    gain_m: float = 3.0
+    altitude_m: float
 
 
-def test_unknown_names_list_the_known_ones():
-    with pytest.raises(KeyError, match="parallel_lines"):
-        get("aerial", "spiral")
-    with pytest.raises(ValueError, match="aerial, ground"):
-        register("naval", "x")
+class Climb:
+    Settings = ClimbSettings
+    vehicles = ("multirotor",)
+    period_s = 0.5
+
+    def start(self, task, key):
+        return 0.0
+
+    def act(self, task, memory, view, key):
+        return memory, None
 
 
-def test_a_name_belongs_to_one_function():
-    @register("aerial", "mine")
-    def mine(task, site):
-        return task
+climb = Climb()
+
+
+class Plan:
+    def plan(self, task, site, situation):
+        return None
+
+
+class Needy(Plan):
+    def __init__(self, gain):
+        self.gain = gain
+
+
+class Broken:
+    def act(self, task, memory, view, key):
+        return memory, None
+
+
+def function(task, memory, view, key):
+    return memory, None
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with a project and climb.py; the path of its recon.yaml."""
+    mission = make_project(tmp_path)
+    (tmp_path / "climb.py").write_text(CLIMB)
+    monkeypatch.chdir(tmp_path)
+    return mission
+
+
+def message_of(reference: str, near: Path | None = None) -> str:
+    with pytest.raises(InputError) as caught:
+        find(reference, near)
+    return str(caught.value)
+
+
+def test_shipped_policies_are_found_by_name() -> None:
+    assert set(SETTINGS) <= set(names())
+    for name, model in SETTINGS.items():
+        policy = find(name)
+        assert callable(getattr(policy, "plan", None)) or callable(policy.act)
+        assert registry.settings_model(name) is model
+        assert registry.vehicle_kinds(name) == model.vehicles
+        assert registry.digest(name) == ""
+
+
+def test_a_misspelt_name_lists_the_known_ones() -> None:
+    message = message_of("paralel_lines")
+    assert "there is no policy 'paralel_lines'" in message
+    assert "one of approach_and_orbit, hold" in message
+    assert "did you mean 'parallel_lines'" in message
+
+
+def test_a_policy_registered_in_python_is_found_by_its_name() -> None:
+    @register("mine")
+    class Mine:
+        def plan(self, task, site, situation):
+            return None
 
     try:
-        assert get("aerial", "mine") is mine
-        with pytest.raises(ValueError, match="already"):
-            register("aerial", "mine")(lambda task, site: site)
+        assert isinstance(find("mine"), Mine)
+        assert "mine" in names()
+        assert registry.settings_model("mine") is PolicySettings
+        assert registry.vehicle_kinds("mine") == ("multirotor", "skid_steer")
+        assert registry.digest("mine") == hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+        register("mine")(Mine)
+        with pytest.raises(ValueError, match="'mine' is already"):
+            register("mine")(type("Other", (Mine,), {}))
     finally:
-        del _policies["aerial"]["mine"]
+        del registry._registered["mine"]
+    with pytest.raises(TypeError, match="without act and without plan"):
+        register("other")(object())
+    with pytest.raises(ValueError, match="no ':'"):
+        register("a:b")
+
+
+def test_a_file_gives_the_same_object_until_it_changes(project: Path) -> None:
+    climb, again = find("climb.py:climb"), find("./climb.py:climb")
+    assert climb is again
+    assert climb.period_s == 0.5
+    made = find("climb.py:Plan")
+    assert made is find("climb.py:Plan")
+    assert type(made).__name__ == "Plan"
+    file = project.parents[2] / "climb.py"
+    assert registry.digest("climb.py:climb") == hashlib.sha256(CLIMB.encode()).hexdigest()
+    file.write_text(CLIMB.replace("0.5", "0.25"))
+    assert find("climb.py:climb").period_s == 0.25
+    assert climb.period_s == 0.5
+
+
+def test_a_file_beside_the_mission_comes_before_one_in_the_working_folder(project: Path) -> None:
+    (project.parent / "climb.py").write_text(CLIMB.replace("0.5", "2.0"))
+    assert find("climb.py:climb", project).period_s == 2.0
+    assert find("climb.py:climb").period_s == 0.5
+
+
+def test_a_file_may_import_its_neighbour(project: Path) -> None:
+    (project.parent / "helper_of_climb.py").write_text("PERIOD_S = 7.0\n")
+    (project.parent / "two.py").write_text(
+        "from helper_of_climb import PERIOD_S\n" + CLIMB.replace("= 0.5", "= PERIOD_S")
+    )
+    assert find("two.py:climb", project).period_s == 7.0
+    assert str(project.parent) not in sys.path
+
+
+@pytest.mark.parametrize(
+    ("reference", "fragments"),
+    [
+        ("clim.py:climb", ["there is no file 'clim.py'", "did you mean 'climb.py'"]),
+        ("no/such.py:climb", ["there is no file 'no/such.py'"]),
+        ("climb.py:clim", ["'climb.py' holds no object 'clim'", "one of", "did you mean 'climb'"]),
+        ("climb.py:", ["is not a reference to a policy", "'file.py:object'"]),
+        (":climb", ["is not a reference to a policy"]),
+        ("climb.py:function", ["is no policy: it is a function without act and without plan", "start(task, key)"]),
+        ("climb.py:Broken", ["has act and no start"]),
+        ("climb.py:Needy", ["cannot be made without arguments", "gain", "defaults"]),
+        ("climb.py:PolicySettings", ["is no policy"]),
+        ("no_such_package.policies:climb", ["there is no module 'no_such_package'", "'policies.py:climb'"]),
+        ("math:sqrt", ["'math:sqrt' is no policy"]),
+    ],
+)
+def test_a_reference_that_leads_to_no_policy(project: Path, reference: str, fragments: list[str]) -> None:
+    message = message_of(reference, project)
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.mark.parametrize(
+    ("text", "fragment"),
+    [
+        ("import math\n\nx = 1 / 0\n", "bad.py:3: ZeroDivisionError: division by zero"),
+        ("x = (1,\ny = 2\n", "SyntaxError"),
+        ("import sys\nsys.exit(3)\n", "bad.py:2: SystemExit: 3"),
+        ("import no_such_module_at_all\n", "bad.py:1: ModuleNotFoundError: No module named 'no_such_module_at_all'"),
+    ],
+)
+def test_a_file_that_cannot_be_imported_is_told_with_its_line(project: Path, text: str, fragment: str) -> None:
+    Path("bad.py").write_text(text)
+    message = message_of("bad.py:climb")
+    assert "cannot be imported: bad.py:" in message
+    assert fragment in message
+
+
+def test_modules_and_entry_points(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = project.parents[2]
+    (folder / "installed_policies.py").write_text(CLIMB)
+    (folder / "installed.dist-info").mkdir()
+    (folder / "installed.dist-info" / "METADATA").write_text("Name: installed\nVersion: 1\n")
+    points = "[swarmsim.policies]\nuphill = installed_policies:climb\nlost = installed_policies:nothing\n"
+    (folder / "installed.dist-info" / "entry_points.txt").write_text(points)
+    monkeypatch.syspath_prepend(folder)
+    module = find("installed_policies:climb")
+    assert find("uphill") is module
+    assert {"uphill", "lost"} <= set(names())
+    assert registry.settings_model("uphill").__name__ == "ClimbSettings"
+    assert registry.digest("uphill") == hashlib.sha256(CLIMB.encode()).hexdigest()
+    assert "the entry point 'installed_policies:nothing' of the policy 'lost' cannot be loaded" in message_of("lost")
+
+
+def phase_of(settings: str, policy: str = "climb.py:climb", who: str = "uav1") -> str:
+    return f"phases.0={{name: survey, who: {who}, policy: '{policy}', settings: {settings}, time_limit_s: 60}}"
+
+
+def test_a_scenario_with_a_policy_of_the_users(project: Path) -> None:
+    scenario = load_scenario(project, [phase_of("{altitude_m: 12}")])
+    settings = scenario.settings[0]
+    assert (settings.gain_m, settings.altitude_m) == (3.0, 12.0)
+    assert find(scenario.mission.phases[0].policy, scenario.mission_file).Settings is type(settings)
+    assert scenario.versions()["policy_sha256.climb.py:climb"] == hashlib.sha256(CLIMB.encode()).hexdigest()
+    assert load_scenario(project, [phase_of("{}", "climb.py:Plan")]).settings[0] == PolicySettings()
+
+
+@pytest.mark.parametrize(
+    ("override", "fragment"),
+    [
+        (phase_of("{}"), "phases.0.settings.altitude_m: this field is missing"),
+        (phase_of("{altitude_m: 3, gian_m: 3}"), "phases.0.settings.gian_m: there is no field 'gian_m' here"),
+        (phase_of("{altitude_m: high}"), "phases.0.settings.altitude_m: is not a number"),
+        (phase_of("{altitude_m: 3}", who="all"), "the policy 'climb.py:climb' cannot command 'orpheus', a skid_steer"),
+        (phase_of("{}", "clim.py:climb"), "phases.0.policy: there is no file 'clim.py'"),
+        (phase_of("{gain_m: 3}", "climb.py:Plan"), "phases.0.settings.gain_m: there is no field 'gain_m' here"),
+    ],
+)
+def test_a_policy_of_the_users_with_wrong_settings(project: Path, override: str, fragment: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_scenario(project, [override])
+    assert fragment in str(caught.value)
+
+
+def test_settings_that_are_no_model_are_refused(project: Path) -> None:
+    Path("wrong.py").write_text(CLIMB.replace("Settings = ClimbSettings", "Settings = dict"))
+    with pytest.raises(InputError, match="an attribute Settings that is no settings model"):
+        registry.settings_model("wrong.py:climb")
+
+
+def test_a_written_scenario_finds_the_policy_from_anywhere(
+    project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (project.parent / "beside.py").write_text(CLIMB)
+    near, here = phase_of("{altitude_m: 12}", "beside.py:climb"), phase_of("{altitude_m: 12}")
+    assert "policy: climb.py:climb" in load_scenario(project, [here]).to_yaml()
+    scenario = load_scenario(project, [near])
+    written = tmp_path_factory.mktemp("run") / "scenario.yaml"
+    written.write_text(scenario.to_yaml())
+    monkeypatch.chdir(written.parent)
+    again = load_scenario(written)
+    assert again.mission.phases[0].policy == f"{(project.parent / 'beside.py').resolve()}:climb"
+    assert again.settings == scenario.settings

@@ -10,9 +10,11 @@ from swarmsim.config.files import packaged_dir
 from swarmsim.config.load import load_model, load_named
 from swarmsim.config.radiation import Detector, Material
 from swarmsim.radiation import Library, build_detector, load_library
-from swarmsim.radiation.build_up import fit, number_build_up, scattered_fraction, transport
 from swarmsim.radiation.library import BUILD_UP_SCALE, build_up_coefficients, linear_attenuation, mass_attenuation
+from tests.generator_scripts import script
 from tests.radiation.points import MOUNT
+
+monte_carlo = script("materials/generate_build_up.py")
 
 # NIST tables at 59.5, 662, 1173 and 1332 keV, cm2/g
 NIST = {
@@ -149,7 +151,7 @@ def test_every_number_of_a_detector_has_a_source(name: str) -> None:
 def test_build_up_tables_are_what_the_monte_carlo_gives(library: Library, name: str) -> None:
     material = library.material(name)
     for energy in (120.0, 662.0, 1250.0):
-        depth, expected = number_build_up(material, energy, photons=6000, seed=5)
+        depth, expected = monte_carlo.number_build_up(material, energy, photons=6000, seed=5)
         c, d, p = build_up_coefficients(material, energy)
         table = 1 + c * depth * (1 + depth / BUILD_UP_SCALE) ** p * np.exp(d * depth)
         shallow = depth < 4.5
@@ -169,7 +171,7 @@ def test_published_number_build_up(library: Library) -> None:
 
 def test_no_build_up_without_scattering_survivors(library: Library) -> None:
     """In lead at 60 keV nearly everything is absorbed."""
-    _, build_up = number_build_up(library.material("lead"), 60.0, photons=3000)
+    _, build_up = monte_carlo.number_build_up(library.material("lead"), 60.0, photons=3000)
     assert np.all(build_up < 1.1)
     assert np.all(build_up >= 1.0)
 
@@ -177,13 +179,13 @@ def test_no_build_up_without_scattering_survivors(library: Library) -> None:
 def test_klein_nishina_against_the_free_electron(library: Library) -> None:
     """Compton share of carbon-like matter at 662 keV: sigma_KN = 0.2563 barn per electron (Hubbell 1975)."""
     water = library.material("water")
-    tables = transport(water, 700.0)
+    tables = monte_carlo.transport(water, 700.0)
     compton = np.interp(np.log(662.0), tables.log_energy, tables.compton_share * tables.interaction_cm2_g)
     assert compton == pytest.approx(0.2563 * 0.602214 * water.electrons_mol_g, rel=0.003)
-    assert scattered_fraction(np.array(661.66), np.array(-1.0)) * 661.66 == pytest.approx(184.3, abs=0.2)
+    assert monte_carlo.scattered_fraction(np.array(661.66), np.array(-1.0)) * 661.66 == pytest.approx(184.3, abs=0.2)
 
 
 def test_fit_recovers_its_own_form() -> None:
     depth = np.linspace(0.1, 8.0, 20)
     build_up = 1 + 1.7 * depth * (1 + depth / BUILD_UP_SCALE) ** 0.4 * np.exp(0.05 * depth)
-    np.testing.assert_allclose(fit(depth, build_up), (1.7, 0.05, 0.4), rtol=1e-6)
+    np.testing.assert_allclose(monte_carlo.fit(depth, build_up), (1.7, 0.05, 0.4), rtol=1e-6)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from swarmsim.radiation import Detector, Identification, Library, identify, net_rate, spectrum_rate
-from swarmsim.radiation.build_up import klein_nishina, scattered_fraction
 from swarmsim.radiation.identify import hypotheses
 from swarmsim.radiation.response import compton_edge_kev, compton_recoil
+from tests.generator_scripts import script
 from tests.radiation.points import point, through
 
+monte_carlo = script("materials/generate_build_up.py")
 UP, PLACE = jnp.array([0.0, 0.0, 1.0]), jnp.array([0.0, 0.0, 5.0])
 LIVE_S = 60.0
 Detectors = dict[tuple[str, str], Detector]
@@ -70,8 +71,8 @@ def test_compton_formulae() -> None:
     recoil, cosine = np.linspace(0.5, 477.0, 2000), np.linspace(-1, 1, 4001)
     mean = np.sum(recoil * compton_recoil(661.66, recoil)) / np.sum(compton_recoil(661.66, recoil))
     energy = np.array(661.66)
-    by_angle = klein_nishina(energy, cosine)
-    lost = np.sum(by_angle * (1 - scattered_fraction(energy, cosine))) / np.sum(by_angle)
+    by_angle = monte_carlo.klein_nishina(energy, cosine)
+    lost = np.sum(by_angle * (1 - monte_carlo.scattered_fraction(energy, cosine))) / np.sum(by_angle)
     assert mean / 661.66 == pytest.approx(lost, rel=2e-3)  # the same law written by angle
     assert np.all(compton_recoil(661.66, np.array([478.0, 600.0])) == 0)
 

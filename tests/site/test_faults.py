@@ -110,13 +110,17 @@ def test_misspelt_pattern_lists_the_names(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("polygon", "word"),
-    [([[-5, -5], [5, -5], [0, 0], [5, 5], [-5, 5]], "convex"), ([[-5, -5], [500, -5], [0, 5]], "beyond the site"),
-     ([[-5, -5], [5, 5], [5, -5], [-5, 5]], "convex"), ([[0, 0], [1, 1], [2, 2]], "convex")],
+    ("polygon", "words"),
+    [([[-5, -5], [5, -5], [0, 0], [5, 5], [-5, 5]], "not convex"), ([[-5, -5], [5, 5], [5, -5], [-5, 5]], "not convex"),
+     ([[0, 0], [1, 1], [2, 2]], "no area"), ([[-5, -5], [500, -5], [0, 5]], "beyond the site")],
 )  # fmt: skip
-def test_survey_area(tmp_path, polygon, word):
+def test_survey_area(tmp_path, polygon, words):
     yard().export(tmp_path / "yard.stl")
-    refused(tmp_path / "yard.stl", [word], survey_area_m=polygon)
+    options = ImportOptions(fields={"survey_area_m": polygon})
+    with pytest.raises(InputError, match=words) as caught:
+        import_site(tmp_path / "yard.stl", tmp_path / "out", options, MATERIALS)
+    assert "survey_area_m" in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["yard.stl"]
 
 
 def test_cells_too_small_and_too_large(tmp_path):

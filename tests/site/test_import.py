@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.ndimage import map_coordinates
-from yards import MATERIALS, TO_X_UP, TO_Y_UP, block, ground_plate, prism, ring, spec, write_tiff, yard
+from yards import (
+    MATERIALS,
+    TO_X_UP,
+    TO_Y_UP,
+    block,
+    ground_plate,
+    prism,
+    ring,
+    spec,
+    write_collada,
+    write_tiff,
+    yard,
+)
 
 from swarmsim.config.errors import InputError
 from swarmsim.site import ImportOptions, import_site, load_site
-from swarmsim.site.collada import write_collada
 from swarmsim.site.importer import build
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.raster import Grid, edges_on, faces_on, highest

@@ -13,9 +13,11 @@ from yards import MATERIALS
 from swarmsim import site as sites
 from swarmsim.config.files import find
 from swarmsim.config.load import load_named
-from swarmsim.site import load_site, sample, works_yard
+from swarmsim.site import load_site, sample
 from swarmsim.site.importer import build
+from tests.generator_scripts import script
 
+works_yard = script("sites/works_yard/generate.py")
 FOLDER = Path(find("sites", "works_yard")).parent
 SOURCE = np.array([12.0, 4.0])
 path_lengths = jax.jit(sites.path_lengths)

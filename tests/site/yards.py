@@ -8,7 +8,10 @@ from rasterio.transform import Affine
 
 from swarmsim.config.site import SiteSpec
 from swarmsim.site import Obstacles, Site
-from swarmsim.site.shapes import polygon_prism
+from tests.generator_scripts import script
+
+polygon_prism = script("sites/mesh_shapes.py").polygon_prism
+write_collada = script("sites/collada_writer.py").write_collada
 
 MATERIALS = ("air", "brick", "concrete", "soil", "steel", "vegetation", "wood")
 TO_Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], float)

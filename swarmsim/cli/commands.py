@@ -1,0 +1,297 @@
+"""The commands: thin, and quick to start. What they need is imported when they run."""
+
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+from cyclopts.validators import Number
+
+from swarmsim.config.errors import InputError
+
+EXIT_INPUT, EXIT_INTERRUPTED = 2, 130
+SEED_END = 2**31
+
+Kind = Literal["vehicles", "sites", "missions", "detectors", "nuclides", "materials", "policies"]
+ModelKind = Literal["mission", "vehicle", "site", "detector", "nuclide", "material"]
+
+
+def _version() -> str:
+    from swarmsim.versions import NOT_INSTALLED, package_versions
+
+    version = package_versions(())["swarmsim"]
+    return (
+        "swarmsim, run from its source folder without being installed"
+        if version == NOT_INSTALLED
+        else f"swarmsim {version}"
+    )
+
+
+app = App(
+    name="swarmsim",
+    help="Simulate teams of aerial and ground robots, and their search for radioactive sources.",
+    help_epilogue=(
+        "Examples:\n"
+        "    swarmsim run recon           fly the shipped mission, results in runs/recon\n"
+        "    swarmsim view runs/recon     watch it in the Rerun viewer\n"
+        "    swarmsim init my_project     copy the configurations out, to edit them\n"
+        "    swarmsim list vehicles       what there is to build a team of\n\n"
+        "'swarmsim COMMAND --help' says more of a command, with examples.\n"
+        "Exit codes: 0 done, 2 wrong input (told on standard error), 130 stopped with Ctrl-C."
+    ),
+    version=_version,
+    help_format="plaintext",
+    suppress_keyboard_interrupt=False,
+    default_parameter=Parameter(show_default=False, negative=""),
+)
+
+
+command = partial(app.command, help_epilogue="")  # the epilogue above belongs to the whole program
+
+
+@command
+def run(
+    scenario: str,
+    *,
+    out: Path | None = None,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END))] = None,
+    missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1_000_000))] = 1,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    force: bool = False,
+) -> None:
+    """Fly a mission, or many at once, and write the results.
+
+    For example:
+        swarmsim run recon
+        swarmsim run configs/missions/recon.yaml --seed 7 --out runs/seven
+        swarmsim run recon --missions 256
+        swarmsim run recon --set phases.survey.settings.altitude_m=30 --set wind.speed_m_s=5
+        swarmsim run runs/recon/scenario.yaml --out runs/again
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission (see 'swarmsim list missions') or path of a mission file.
+    out
+        Folder of the results; runs/NAME by default. It must not exist, unless --force is given.
+    seed
+        Seed of the (first) mission, instead of the one in the file.
+    missions
+        How many missions to fly in one batch, with seeds N, N+1, …; 1 by default.
+    overrides
+        Change a value of the mission, as path=value; may be given again and again. Items of a list are named by
+        index or by their name, e.g. vehicles.uav1.heading_deg=90.
+    force
+        Replace the results of an earlier run.
+    """
+    from swarmsim.cli.run import run_scenario
+
+    run_scenario(scenario, out, seed, missions, overrides, force)
+
+
+@command
+def bench(
+    scenario: str = "recon",
+    *,
+    missions: Annotated[int, Parameter(validator=Number(gte=2, lte=1_000_000))] = 64,
+    repeats: Annotated[int, Parameter(validator=Number(gte=1, lte=100))] = 2,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+) -> None:
+    """Measure how fast a scenario flies here: one mission, and a batch against it. Writes nothing.
+
+    For example:
+        swarmsim bench
+        swarmsim bench recon --missions 256
+        swarmsim bench recon --set engine=analytic
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission, or a mission file.
+    missions
+        How many missions the batch has; 64 by default.
+    repeats
+        Rollouts of which the fastest counts; 2 by default.
+    overrides
+        Change a value of the mission, as path=value.
+    """
+    from swarmsim.cli.run import bench_scenario
+
+    bench_scenario(scenario, missions, repeats, overrides)
+
+
+@command
+def view(run: Path, *, web: bool = False) -> None:
+    """Open the recording of a run in the Rerun viewer.
+
+    For example:
+        swarmsim view runs/recon
+        swarmsim view runs/recon --web
+
+    Parameters
+    ----------
+    run
+        Folder of a run, or an .rrd file.
+    web
+        Use the viewer in the browser instead of the desktop's.
+    """
+    from swarmsim.playback.viewer import open_recording
+
+    open_recording(run, web)
+
+
+@command
+def check(*paths: Path) -> None:
+    """Validate configuration files of any kind, and tell everything that is wrong with them.
+
+    For example:
+        swarmsim check configs/missions/recon.yaml
+        swarmsim check my_vehicle.yaml configs/nuclides/*.yaml
+        swarmsim check configs
+
+    Parameters
+    ----------
+    paths
+        Files, or folders whose YAML files are all checked. What a file describes is told from its folder
+        (missions, vehicles, sites …) or from its fields.
+    """
+    from swarmsim.cli.files import check_files
+
+    check_files(paths)
+
+
+@command
+def schema(kind: ModelKind = "mission") -> None:
+    """Print the JSON schema of a kind of configuration file, e.g. for an editor's completion.
+
+    For example:
+        swarmsim schema
+        swarmsim schema vehicle > vehicle.schema.json
+
+    Parameters
+    ----------
+    kind
+        Which configuration file; mission by default.
+    """
+    from swarmsim.cli.files import print_schema
+
+    print_schema(kind)
+
+
+@command(name="list")
+def list_(kind: Kind | None = None) -> None:
+    """List what is available: vehicles, sites, missions, detectors, nuclides, materials and policies.
+
+    For example:
+        swarmsim list
+        swarmsim list nuclides
+
+    Parameters
+    ----------
+    kind
+        List this kind only.
+    """
+    from swarmsim.cli.files import list_available
+
+    list_available(kind)
+
+
+@command
+def init(folder: Path) -> None:
+    """Copy the shipped configurations to FOLDER/configs, to be edited; names found there come before the shipped ones.
+
+    For example:
+        swarmsim init .
+        swarmsim init my_project && cd my_project && swarmsim run recon
+
+    Parameters
+    ----------
+    folder
+        Where to put 'configs'; made if needed. An existing 'configs' is never overwritten.
+    """
+    from swarmsim.cli.files import copy_configurations
+
+    copy_configurations(folder)
+
+
+@command
+def import_site(
+    file: Path,
+    *,
+    out: Path,
+    name: str | None = None,
+    unit: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
+    up: Literal["X", "Y", "Z"] | None = None,
+    cell: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
+    ground: Annotated[tuple[str, ...], Parameter(consume_multiple=False)] = (),
+    licence: str | None = None,
+    force: bool = False,
+) -> None:
+    """Turn a mesh (.dae, .obj, .glb, .stl) or an elevation model (GeoTIFF) into a site.
+
+    For example:
+        swarmsim import-site farm.dae --out configs/sites/farm
+        swarmsim import-site yard.obj --out configs/sites/yard --unit 0.01 --up Y
+        swarmsim import-site yard.glb --out configs/sites/yard --ground 'terrain*'
+        swarmsim import-site alps.tif --out configs/sites/alps --cell 2
+
+    Parameters
+    ----------
+    file
+        The mesh or the elevation model.
+    out
+        Folder of the new site; its name is the site's name unless --name is given.
+    name
+        Name of the site.
+    unit
+        Metres of one unit of the file, where the file does not say or is wrong.
+    up
+        The axis of the file that points up, where the file does not say or is wrong.
+    cell
+        Size of the cells of the height maps, in metres.
+    ground
+        Pattern of the materials or geometries that are bare ground; may be given again and again.
+    licence
+        Licence of the file, to be written into the site.
+    force
+        Replace an existing site.
+    """
+    from swarmsim.cli.files import import_site_file
+
+    import_site_file(file, out, name, unit, up, cell, ground, licence, force)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line ``arguments`` (those of the process when None); the exit code.
+
+    Wrong input is told on standard error without a traceback; an error of swarmsim itself keeps its traceback.
+    """
+    try:
+        app(
+            sys.argv[1:] if arguments is None else list(arguments),
+            exit_on_error=False,
+            print_error=False,
+            result_action="return_none",
+        )
+    except CycloptsError as error:
+        sys.stderr.write(f"{error}\n\nSee 'swarmsim --help' and 'swarmsim COMMAND --help'.\n")
+        return EXIT_INPUT
+    except InputError as error:
+        sys.stderr.write(f"{describe(error)}\n")
+        return EXIT_INPUT
+    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except KeyboardInterrupt:
+        sys.stderr.write("\nstopped with Ctrl-C: nothing unfinished was left behind\n")
+        return EXIT_INTERRUPTED
+    return 0
+
+
+def describe(error: InputError) -> str:
+    """All problems of an `InputError` as text."""
+    count = len(error.problems)
+    heading = "" if count == 1 else f"{count} problems\n\n"
+    return heading + "\n\n".join(str(problem) for problem in error.problems)

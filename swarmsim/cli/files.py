@@ -1,0 +1,202 @@
+"""What ``swarmsim check``, ``schema``, ``list``, ``init`` and ``import-site`` do."""
+
+import json
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter
+from rich.console import Console
+from rich.table import Table
+
+from swarmsim.atomic_folder import atomic_folder
+from swarmsim.cli.run import value_text
+from swarmsim.config import files
+from swarmsim.config.allowed import shape_of
+from swarmsim.config.catalogue import MODELS
+from swarmsim.config.documents import read_file, shown_path
+from swarmsim.config.errors import InputError, Problem, raise_if_any
+from swarmsim.config.load import load_all, load_named
+from swarmsim.config.names import one_of
+
+
+def check_files(paths: Sequence[Path]) -> None:
+    """Validate every file, say which are right, and raise one `InputError` with the problems of all the others."""
+    if not paths:
+        raise InputError.of("name at least one file or folder to check")
+    problems: list[Problem] = []
+    for path in paths:
+        try:
+            found = list(_yaml_files(path))
+        except InputError as error:
+            problems += error.problems
+            continue
+        for file in found:
+            try:
+                kind = check_file(file)
+            except InputError as error:
+                problems += [problem for problem in error.problems if problem not in problems]
+            else:
+                sys.stdout.write(f"ok  {shown_path(file)} ({kind.removesuffix('s')})\n")
+    raise_if_any(problems)
+
+
+def check_file(path: Path) -> str:
+    """Validate one file with all that it refers to; its kind. Raises `InputError`."""
+    kind = kind_of_file(path)
+    if kind == "missions":
+        from swarmsim.config.scenario import load_scenario
+        from swarmsim.config.site_checks import check_site
+
+        raise_if_any(check_site(load_scenario(path)))
+    elif kind == "sites":
+        load_named(kind, path)
+        from swarmsim.site import load_site
+
+        load_site(path, tuple(load_all("materials", path)))
+    else:
+        load_named(kind, path)
+    return kind
+
+
+def kind_of_file(path: Path) -> str:
+    """Kind of a configuration file, from the folder that it lies in or else from its fields."""
+    for folder in path.absolute().parents[:2]:
+        if folder.name in files.KINDS:
+            return folder.name
+    fields = read_file(path).data
+    if "kind" in fields:
+        return "vehicles"
+    own = {kind: set(shape_of(model).fields((), None)) for kind, model in MODELS.items() if kind != "vehicles"}
+    shared = {kind: len(names & set(fields)) for kind, names in own.items()}
+    best = max(shared, key=lambda kind: shared[kind])
+    if shared[best] < 2 or sum(count == shared[best] for count in shared.values()) > 1:
+        hint = f"put it in a folder named {one_of(files.KINDS).removeprefix('one of ')}"
+        raise InputError.of(
+            "cannot tell what this file describes", file=shown_path(path), given=", ".join(fields), suggestion=hint
+        )
+    return best
+
+
+def _yaml_files(path: Path) -> Iterator[Path]:
+    if not path.is_dir():
+        yield files.find("missions", path)
+        return
+    found = sorted(file for suffix in ("*.yaml", "*.yml") for file in path.rglob(suffix))
+    if not found:
+        raise InputError.of("holds no YAML file", file=str(path))
+    yield from found
+
+
+def print_schema(kind: str) -> None:
+    """Print the JSON schema of a kind (in the singular)."""
+    schema = TypeAdapter(MODELS[f"{kind}s"]).json_schema()
+    sys.stdout.write(json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema"} | schema, indent=2) + "\n")
+
+
+def list_available(kind: str | None) -> None:
+    """Print the names of a kind, or of all kinds, with what they are and where they stand."""
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    for one in (*files.KINDS, "policies") if kind is None else (kind,):
+        table = Table("name", "what", "file", title=one, title_justify="left", title_style="bold")
+        for row in _policy_rows() if one == "policies" else _file_rows(one):
+            table.add_row(*row)
+        console.print(table)
+
+
+def _policy_rows() -> Iterator[tuple[str, str, str]]:
+    from swarmsim.policies import find, names
+    from swarmsim.policies.registry import vehicle_kinds
+
+    for name in names():
+        policy = find(name)
+        summary = (policy.__doc__ or "").strip().split("\n")[0]
+        yield name, f"{', '.join(vehicle_kinds(name))}: {summary}", type(policy).__module__
+
+
+def _file_rows(kind: str) -> Iterator[tuple[str, str, str]]:
+    for name, path in files.available(kind).items():
+        try:
+            yield name, _describe(kind, load_named(kind, path)), shown_path(path)
+        except InputError as error:
+            count = len(error.problems)
+            yield name, f"not valid: {count} problem{'s' * (count > 1)}, see swarmsim check", shown_path(path)
+
+
+def _describe(kind: str, model: Any) -> str:
+    match kind:
+        case "detectors":
+            return f"{model.crystal}, {model.diameter_mm:g} mm x {model.length_mm:g} mm"
+        case "nuclides":
+            strongest = sorted(model.lines, key=lambda line: -line.yield_percent)[:3]
+            return ", ".join(f"{line.energy_kev:g} keV ({line.yield_percent:g} %)" for line in strongest)
+        case "materials":
+            return f"{model.density_kg_m3:g} kg/m3"
+    return str(model.description)
+
+
+def copy_configurations(folder: Path) -> None:
+    """Copy the packaged configurations to ``folder/configs``, completely or not at all."""
+    target = folder / "configs"
+    with atomic_folder(target, _check_new) as copy:
+        # Scripts that generate shipped data are not configuration. The temporary folder may lie within the source.
+        leave_out = shutil.ignore_patterns("*.py", "__pycache__", ".*")
+        shutil.copytree(files.packaged_dir(), copy, ignore=leave_out, dirs_exist_ok=True)
+    count = sum(1 for path in target.rglob("*") if path.is_file())
+    go = "" if folder.resolve() == Path.cwd() else f"cd {folder} && "
+    sys.stdout.write(f"{count} files copied to {target}\nFly the first mission: {go}swarmsim run recon\n")
+
+
+def _check_new(target: Path) -> None:
+    if target.exists():
+        raise InputError.of(
+            "is there already and is not overwritten", file=str(target), suggestion="choose another folder"
+        )
+    if target.parent.exists() and not target.parent.is_dir():
+        raise InputError.of("is a file, not a folder", file=str(target.parent))
+
+
+def import_site_file(
+    file: Path,
+    out: Path,
+    name: str | None,
+    unit_m: float | None,
+    up_axis: str | None,
+    cell_m: float | None,
+    ground: tuple[str, ...],
+    licence: str | None,
+    force: bool,
+) -> None:
+    """Import a mesh or an elevation model as a site and say what was found in it."""
+    if out.exists() and not force:
+        raise InputError.of(
+            "there is something already",
+            path="--out",
+            given=str(out),
+            suggestion="choose another folder, or replace the site with --force",
+        )
+    given = {"unit_m": unit_m, "up_axis": up_axis, "ground": list(ground) or None}
+    fields = {key: value for key, value in given.items() if value is not None}
+
+    from swarmsim.site import ImportOptions, import_site
+
+    options = ImportOptions(
+        name=name, cell_m=cell_m, fields=fields, overwrite=force, licence=licence or ImportOptions.licence
+    )
+    model = import_site(file, out, options)
+    table = Table("what", "value", title=f"site {model.name}", title_justify="left")
+    for key, value in model.report.items():
+        table.add_row(key, _parts(value) if key == "parts" else value_text(value))
+    console = Console()
+    console.print(table)
+    console.print(f"Site: {out}", highlight=False, soft_wrap=True)
+
+
+def _parts(parts: list[dict[str, Any]]) -> str:
+    """What the parts of a mesh were taken for: one line for each material, with the names of its parts."""
+    names: dict[str, dict[str, None]] = {}
+    for part in parts:
+        names.setdefault(part["is"], {})[part["names"][0]] = None
+    return "\n".join(f"{what}: {', '.join(found)}" for what, found in names.items())

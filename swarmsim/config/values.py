@@ -1,0 +1,27 @@
+"""A scenario with other values: what a sweep or a batch of missions varies."""
+
+import copy
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from swarmsim.config.allowed import shape_of
+from swarmsim.config.mission import Mission
+from swarmsim.config.overrides import apply_overrides
+from swarmsim.config.scenario import Scenario, resolve
+
+
+def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
+    """The scenario with ``values`` at dotted paths (``sources.0.activity_mbq``), checked as a whole.
+
+    Raises `InputError` with everything that is wrong with the paths, the values and what they make of the scenario.
+    """
+    document = copy.deepcopy(scenario.document)
+    texts = [f"{path}={json.dumps(plain(value))}" for path, value in values.items()]
+    apply_overrides(document, texts, shape_of(Mission))
+    return resolve(document, scenario.mission_file, [])
+
+
+def plain(value: Any) -> Any:
+    """Numbers and arrays of numpy and JAX as Python's."""
+    return value.tolist() if hasattr(value, "tolist") else value

@@ -1,0 +1,85 @@
+"""Counts gathered while vehicles measure: samples of a vehicle added up over windows, in arrays of fixed size."""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.estimation.measurements import Measurements
+from swarmsim.pytree import pytree
+
+
+@pytree
+class Windows:
+    """Sums over the samples of each window; U vehicles of W windows each."""
+
+    samples: jax.Array  # [U] int32: samples that each vehicle has taken
+    time_s: jax.Array  # [U, W] end of the last sample
+    position_m: jax.Array  # [U, W, 3] sum over samples of exposure times place, world
+    travel_m: jax.Array  # [U, W, 3] sum of the ways, world
+    axis: jax.Array  # [U, W, 3] sum over samples of exposure times crystal axis, world
+    counts: jax.Array  # [U, W]
+    exposure_s: jax.Array  # [U, W]
+
+
+def windows_start(vehicles: int, windows: int) -> Windows:
+    """Nothing measured yet."""
+    scalars, vectors = jnp.zeros((vehicles, windows)), jnp.zeros((vehicles, windows, 3))
+    return Windows(
+        samples=jnp.zeros(vehicles, jnp.int32),
+        time_s=scalars,
+        position_m=vectors,
+        travel_m=vectors,
+        axis=vectors,
+        counts=scalars,
+        exposure_s=scalars,
+    )
+
+
+def gather(windows: Windows, samples: Measurements, new: jax.Array, per_window: int) -> Windows:
+    """The windows with further samples, which follow one another in time.
+
+    Args:
+        windows: of U vehicles.
+        samples: [F, U] on every field.
+        new: [F, U] bool, which of them are to be taken.
+        per_window: consecutive samples of a vehicle in a window (static).
+
+    Returns:
+        The sums; samples beyond the last window are dropped.
+    """
+    frames, vehicles = new.shape
+    number = windows.samples + jnp.cumsum(new, axis=0) - 1  # [F, U]
+    slot = jnp.where(new, number // per_window, windows.counts.shape[1])
+    vehicle = jnp.broadcast_to(jnp.arange(vehicles), (frames, vehicles))
+    exposure = jnp.where(new, samples.exposure_s, 0.0)
+
+    def add(total: jax.Array, value: jax.Array) -> jax.Array:
+        return total.at[vehicle, slot].add(value, mode="drop")
+
+    return Windows(
+        samples=windows.samples + jnp.sum(new, axis=0, dtype=jnp.int32),
+        time_s=windows.time_s.at[vehicle, slot].max(samples.time_s, mode="drop"),
+        position_m=add(windows.position_m, exposure[..., None] * samples.position_m),
+        travel_m=add(windows.travel_m, samples.travel_m),
+        axis=add(windows.axis, exposure[..., None] * samples.axis),
+        counts=add(windows.counts, samples.counts),
+        exposure_s=add(windows.exposure_s, exposure),
+    )
+
+
+def measured(windows: Windows, detector: int) -> Measurements:
+    """The windows as measurements [U W] of detector model ``detector``; unused ones are not valid."""
+    valid = windows.exposure_s > 0.0
+    exposure = jnp.where(valid, windows.exposure_s, 1.0)[..., None]
+    norm = jnp.sqrt(jnp.sum(windows.axis**2, axis=-1, keepdims=True))
+    axis = jnp.where(norm > 1e-6 * exposure, windows.axis / jnp.maximum(norm, 1e-9), jnp.array([0.0, 0.0, 1.0]))
+    each = Measurements(
+        time_s=windows.time_s,
+        position_m=windows.position_m / exposure,
+        travel_m=windows.travel_m,
+        axis=axis,
+        counts=windows.counts,
+        exposure_s=windows.exposure_s,
+        valid=valid,
+        detector=jnp.full(valid.shape, detector, jnp.int32),
+    )
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), each)

@@ -1,0 +1,164 @@
+"""The beginning of a mission and of its phases."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.estimation import extract_hotspots, recursive_map
+from swarmsim.estimation.windows import windows_start
+from swarmsim.missions import knowledge
+from swarmsim.missions.acting import TASK_AXES, VIEW_AXES, period_ticks, phase_keys, policy_of, rows, tasks, views
+from swarmsim.missions.plan import Phase, Plan
+from swarmsim.missions.state import NO_PHASE, MissionState, PhaseState, Signals, Survey, now_of
+from swarmsim.policies.path import Path
+from swarmsim.policies.protocol import Situation
+from swarmsim.world import events
+from swarmsim.world.model import World
+from swarmsim.world.step import reset
+
+
+def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionState, Signals]:
+    """Every vehicle at rest at its start, no phase begun."""
+    state = reset(world, key, active=False)
+    windows = tuple(
+        windows_start(group.size, size) if size else None
+        for group, size in zip(world.groups, plan.windows, strict=True)
+    )
+    mission = MissionState(
+        world=state,
+        phases=(),
+        phase_of=tuple(jnp.full(group.size, NO_PHASE, jnp.int32) for group in world.groups),
+        belief=None if plan.mapping is None else recursive_map.start(plan.mapping, plan.bin_cells),
+        windows=windows,
+        survey=_no_survey(world, plan, windows),
+        over_s=jnp.asarray(jnp.inf, jnp.float32),
+    )
+    seen = views(world, plan, state, mission.belief)
+    mission = replace(mission, phases=tuple(_idle(world, plan, phase, mission, seen) for phase in plan.phases))
+    begin = jnp.stack([jnp.asarray((phase.start.kind == "at") & (phase.start_s <= 0.0)) for phase in plan.phases])
+    active = jnp.zeros(len(world.groups), bool)
+    running = jnp.zeros(len(plan.phases), bool)
+    return mission, Signals(begin=begin, running=running, active=active, over=jnp.array(False))
+
+
+def _no_survey(world: World, plan: Plan, windows: Any) -> Survey | None:
+    """Room for a survey, where a phase asks for the source."""
+    if not any(phase.target == "source" for phase in plan.phases):
+        return None
+    shape = jax.eval_shape(lambda: knowledge.survey(plan, knowledge.gathered(world, windows)))
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+
+
+def _idle(world: World, plan: Plan, phase: Phase, mission: MissionState, seen: Any) -> PhaseState:
+    """A phase that has not begun: its arrays have their sizes, their contents are not looked at."""
+    never = jnp.asarray(jnp.inf, jnp.float32)
+    path = None
+    if phase.plans:
+        situation = _situation(world, phase, mission, jnp.zeros(2), jnp.array(False))
+        shape = jax.eval_shape(lambda: phase.policy.object.plan(phase.task, plan.site, situation))
+        path = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+    policy = policy_of(world, phase)
+    memory = jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: _memory(world, plan, phase, mission, path))
+    )
+    held = None
+    if period_ticks(world, policy) > 1:
+        held = jax.tree.map(
+            lambda x: jnp.zeros(x.shape, x.dtype),
+            jax.eval_shape(lambda: _first_commands(world, plan, phase, mission, seen, path, memory)),
+        )
+    return PhaseState(
+        began_s=never,
+        asked_s=never,
+        ended_s=never,
+        done_s=jnp.full(phase.size, jnp.inf),
+        in_time=jnp.array(True),
+        memory=memory,
+        held=held,
+        path=path,
+    )
+
+
+def _memory(world: World, plan: Plan, phase: Phase, mission: MissionState, path: Path | None) -> Any:
+    """Memories [M] at the beginning of the phase."""
+    policy, parts, ranks = policy_of(world, phase), [], []
+    for place in phase.places:
+        task = tasks(world, plan, phase, place, path)
+        keys = phase_keys(world, phase, place, mission.world.key, mission.world.clock.tick)
+        parts.append(jax.vmap(policy.start, in_axes=(TASK_AXES, 0))(task, keys))
+        ranks += place.rank
+    order = jnp.argsort(jnp.asarray(ranks))
+    return jax.tree.map(lambda *x: jnp.concatenate(x)[order], *parts)
+
+
+def _first_commands(
+    world: World, plan: Plan, phase: Phase, mission: MissionState, seen: Any, path: Path | None, memory: Any
+) -> tuple[Any, ...]:
+    policy, commands = policy_of(world, phase), []
+    for place in phase.places:
+        task = tasks(world, plan, phase, place, path)
+        own = replace(seen[place.group], time_s=None, belief=None)
+        view = replace(rows(own, place.local), time_s=seen[place.group].time_s, belief=seen[place.group].belief)
+        keys = phase_keys(world, phase, place, mission.world.key, mission.world.clock.tick)
+        call = jax.vmap(policy.act, in_axes=(TASK_AXES, 0, VIEW_AXES, 0))
+        commands.append(call(task, rows(memory, place.rank), view, keys)[1])
+    return tuple(commands)
+
+
+def begin_phase(world: World, plan: Plan, mission: MissionState, number: int) -> MissionState:
+    """The mission with phase ``number`` begun now, or its planner asked again if it has begun already.
+
+    Its vehicles leave the phase that they were in. A vehicle whose part in the mission has ended stays out.
+    """
+    phase, state = plan.phases[number], mission.phases[number]
+    now = now_of(mission, world.timing.control_period_s)
+    mission, target, found = _target(world, plan, phase, mission)
+    path = state.path
+    if phase.plans:
+        situation = _situation(world, phase, mission, target, found)
+        path = phase.policy.object.plan(phase.task, plan.site, situation)
+    groups, phase_of = list(mission.world.groups), list(mission.phase_of)
+    for place in phase.places:
+        local = jnp.asarray(place.local)
+        group = groups[place.group]
+        active = group.active.at[local].set(events.able(group.event_time_s)[local])
+        groups[place.group] = replace(group, active=active)
+        phase_of[place.group] = phase_of[place.group].at[local].set(number)
+    mission = replace(mission, world=replace(mission.world, groups=tuple(groups)), phase_of=tuple(phase_of))
+    begun = replace(
+        state,
+        began_s=jnp.minimum(state.began_s, now),
+        asked_s=now,
+        memory=_memory(world, plan, phase, mission, path),
+        path=path,
+    )
+    phases = tuple(begun if i == number else other for i, other in enumerate(mission.phases))
+    return replace(mission, phases=phases)
+
+
+def _situation(
+    world: World, phase: Phase, mission: MissionState, target_m: jax.Array, found: jax.Array
+) -> Situation:
+    """Where the phase's vehicles are, in their order."""
+    position = jnp.zeros((phase.size, 3))
+    for place in phase.places:
+        here = mission.world.groups[place.group].vehicle.body.position_m
+        position = position.at[jnp.asarray(place.rank)].set(here[jnp.asarray(place.local)])
+    return Situation(position_m=position, target_m=target_m, found=found)
+
+
+def _target(
+    world: World, plan: Plan, phase: Phase, mission: MissionState
+) -> tuple[MissionState, jax.Array, jax.Array]:
+    """The mission with what was learned for it, the place [2] that the phase goes to, and whether [] there is one."""
+    if phase.target == "source":
+        learned = knowledge.survey(plan, knowledge.gathered(world, mission.windows))
+        return replace(mission, survey=learned), learned.fit.position_m[:2], learned.found
+    if phase.target == "hotspot":
+        assert plan.mapping is not None
+        chart = recursive_map.read(plan.mapping, mission.belief)
+        hotspots = extract_hotspots(plan.mapping, chart)
+        return mission, hotspots.position_m[0], hotspots.valid[0]
+    return mission, phase.target_m, jnp.array(phase.target == "point")

@@ -1,0 +1,149 @@
+"""From a scenario to the mission's plan (host)."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from swarmsim.config.mission import Phase as PhaseSpec
+from swarmsim.config.mission import Trigger as TriggerSpec
+from swarmsim.config.scenario import Scenario
+from swarmsim.estimation import localisation_params, mapping_params
+from swarmsim.estimation.recursive_map import default_bin_cells
+from swarmsim.missions.plan import Phase, Place, Plan, PolicyReference, Trigger, Values
+from swarmsim.policies import registry
+from swarmsim.policies.protocol import Assignment
+from swarmsim.site import SiteModel
+from swarmsim.world.build import detector_models, grouped, library_of
+from swarmsim.world.kinds import KINDS
+from swarmsim.world.model import World
+
+
+def listens(scenario: Scenario) -> bool:
+    """Whether a policy of the mission reads what the radio brings."""
+    return any(getattr(_policy(scenario, phase).object, "listens", False) for phase in scenario.mission.phases)
+
+
+def _policy(scenario: Scenario, phase: PhaseSpec) -> PolicyReference:
+    near = scenario.mission_file
+    return PolicyReference(
+        reference=phase.policy, near=None if near is None else str(near), digest=registry.digest(phase.policy, near)
+    )
+
+
+def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
+    """The plan of a checked scenario."""
+    mission, library = scenario.mission, library_of(scenario)
+    counters = {g.counter.index: g.counter for g in reversed(world.groups) if g.counter is not None}
+    detectors = tuple(counters[i].detector for i in range(len(detector_models(scenario))))
+    localisation, identification = mission.localisation, mission.identification
+    nuclide = 0 if localisation is None else library.nuclide_index(localisation.presumed_nuclide)
+    per_window, windows = _windows(scenario, world)
+    mapping = None
+    if mission.mapping is not None and detectors:
+        mapping = mapping_params(mission.mapping, _surveyed(scenario, site_model))
+    return Plan(
+        site=site_model.site,
+        detectors=detectors,
+        mapping=mapping,
+        localisation=None if localisation is None or not detectors else localisation_params(localisation),
+        presumed_nuclide=np.int32(nuclide),
+        spectrum_radius_m=np.float32(0.0 if identification is None else identification.spectrum_radius_m),
+        confidence_min=np.float32(1.0 if identification is None else identification.confidence_min),
+        phases=tuple(_phase(scenario, site_model, i) for i in range(len(mission.phases))),
+        per_window=per_window,
+        windows=windows,
+        starts=1 if localisation is None else localisation.starts,
+        bin_cells=1 if mapping is None else default_bin_cells(mapping),
+        spectrometer=-1 if identification is None else _spectrometer(world),
+    )
+
+
+def _surveyed(scenario: Scenario, site_model: SiteModel) -> np.ndarray:
+    """Corners [V, 2] of what the map covers: the areas that phases survey, or the site's survey area."""
+    areas = [np.array(s.area_m) for s in scenario.settings if getattr(s, "area_m", None) is not None]
+    whole = any(hasattr(s, "area_m") and s.area_m is None for s in scenario.settings)
+    if areas and not whole:
+        return np.concatenate(areas)
+    return np.concatenate([np.asarray(site_model.site.survey_area_m), *areas])
+
+
+def _windows(scenario: Scenario, world: World) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Samples in a window of the estimate, and windows that a vehicle can fill, for each group.
+
+    A vehicle that flies is far from a source, so its samples are put together; one on the ground keeps its own.
+    """
+    localisation = scenario.mission.localisation
+    per_window, windows = [], []
+    for members, group in zip(grouped(scenario), world.groups, strict=True):
+        if group.counter is None or localisation is None:
+            per_window.append(1)
+            windows.append(0)
+            continue
+        sample_s = group.counter.ticks * group.counter.evaluations * world.timing.control_period_s
+        together = max(1, round(localisation.window_s / sample_s)) if KINDS[group.kind].FLIES else 1
+        limit_s = sum(
+            phase.time_limit_s
+            for phase, team in zip(scenario.mission.phases, scenario.phase_members, strict=True)
+            if set(team) & set(members)
+        )
+        per_window.append(together)
+        windows.append(math.ceil(limit_s / (sample_s * together)) + 1 if limit_s else 0)
+    return tuple(per_window), tuple(windows)
+
+
+def _spectrometer(world: World) -> int:
+    """Detector model whose spectra are identified: that of a rover, which comes near; else the first."""
+    models = [(KINDS[g.kind].FLIES, g.counter.index) for g in world.groups if g.counter is not None]
+    return min(models)[1] if models else -1
+
+
+def _phase(scenario: Scenario, site_model: SiteModel, number: int) -> Phase:
+    spec, settings = scenario.mission.phases[number], scenario.settings[number]
+    members = scenario.phase_members[number]
+    policy = _policy(scenario, spec)
+    plans = hasattr(policy.object, "plan")
+    task: Any = None
+    if plans:
+        assignment = Assignment(scenario=scenario, settings=settings, members=members, site_model=site_model)
+        task = policy.object.task(assignment)
+    target = getattr(settings, "target", None)
+    kind = "none" if target is None else target if isinstance(target, str) else "point"
+    team = [scenario.members[i] for i in members]
+    names = [phase.name for phase in scenario.mission.phases]
+    return Phase(
+        task=task,
+        settings=Values.of(settings),
+        target_m=np.asarray(target if kind == "point" else (0.0, 0.0), np.float32),
+        start_s=np.float32(_seconds(spec.start)),
+        end_s=np.float32(0.0 if spec.end is None else _seconds(spec.end)),
+        time_limit_s=np.float32(spec.time_limit_s),
+        home_m=np.asarray([m.position_m for m in team], np.float32),
+        yaw_rad=np.radians([m.heading_deg for m in team]).astype(np.float32),
+        name=spec.name,
+        policy=policy,
+        places=_places(scenario, members),
+        start=_trigger(spec.start, names),
+        end=None if spec.end is None else _trigger(spec.end, names),
+        target=kind,
+    )
+
+
+def _places(scenario: Scenario, members: tuple[int, ...]) -> tuple[Place, ...]:
+    places = []
+    for number, group in enumerate(grouped(scenario)):
+        inside = [i for i in members if i in set(group)]
+        if inside:
+            local, rank = tuple(group.index(i) for i in inside), tuple(members.index(i) for i in inside)
+            places.append(Place(group=number, local=local, rank=rank))
+    return tuple(places)
+
+
+def _trigger(spec: TriggerSpec, names: list[str]) -> Trigger:
+    if spec.after is not None:
+        return Trigger(kind="after", phase=names.index(spec.after))
+    return Trigger(kind="at" if spec.when is None else "when")
+
+
+def _seconds(spec: TriggerSpec) -> float:
+    return (spec.at_s or 0.0) + spec.delay_s

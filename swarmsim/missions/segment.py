@@ -1,0 +1,245 @@
+"""One segment of a mission: from one decision to the next, and what was decided."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.estimation import Measurements, extract_hotspots, recursive_map
+from swarmsim.estimation.windows import gather
+from swarmsim.missions.acting import TASK_AXES, VIEW_AXES, act, policy_of, rows, tasks, views
+from swarmsim.missions.plan import Phase, Plan, Trigger
+from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track, now_of
+from swarmsim.world import events
+from swarmsim.world.judge import judge
+from swarmsim.world.model import World
+from swarmsim.world.step import advance
+
+RESTING_HEIGHT_M = 0.1  # a vehicle whose part is done rests if it stands on the ground, else it hovers
+
+
+def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionState, Log, Signals]:
+    """Run one mission for one decision period, then decide which phases end and begin.
+
+    The policies see what the team knew at the beginning of the period; what was counted in it is added at its end.
+    """
+    timing = world.timing
+    period_s = jnp.float32(timing.control_period_s)
+
+    def tick(mission: MissionState, _: None) -> tuple[MissionState, None]:
+        seen = views(world, plan, mission.world, mission.belief)
+        phases, commands = act(world, plan, mission, seen)
+        return replace(mission, phases=phases, world=advance(world, mission.world, commands)), None
+
+    def frame(mission: MissionState, _: None) -> tuple[MissionState, tuple[Any, Any]]:
+        mission = replace(mission, world=judge(world, mission.world))
+        began = now_of(mission, timing.control_period_s)
+        mission, _ = jax.lax.scan(tick, mission, None, length=timing.judge_ticks)
+        mission = _finished(world, plan, mission)
+        return mission, (_poses(mission), _samples(mission, began + 0.5 * period_s))
+
+    frames = timing.decision_ticks // timing.judge_ticks
+    every = timing.log_ticks // timing.judge_ticks
+    first = mission.world.clock.tick
+    mission, (poses, samples) = jax.lax.scan(frame, mission, None, length=frames)
+    mission = _learned(world, plan, mission, samples)
+    mission, signals = decide(world, plan, mission)
+    ends = first + timing.log_ticks * (1 + jnp.arange(timing.decision_ticks // timing.log_ticks))
+    tracks = jax.tree.map(lambda x: x[every - 1 :: every], poses)
+    return mission, Log(time_s=ends * period_s, tracks=tracks, samples=samples), signals
+
+
+def _finished(world: World, plan: Plan, mission: MissionState) -> MissionState:
+    """The mission with the vehicles whose part in their phase is done; those on the ground rest."""
+    now = now_of(mission, world.timing.control_period_s)
+    seen = views(world, plan, mission.world, mission.belief)
+    phases, groups = [], list(mission.world.groups)
+    for number, (phase, state) in enumerate(zip(plan.phases, mission.phases, strict=True)):
+        policy = policy_of(world, phase)
+        done_s = state.done_s
+        for place in phase.places if hasattr(policy, "done") else ():
+            view = replace(seen[place.group], time_s=None, belief=None)  # type: ignore[arg-type]
+            view = replace(rows(view, place.local), time_s=now, belief=seen[place.group].belief)
+            task = tasks(world, plan, phase, place, state.path)
+            done = jax.vmap(policy.done, in_axes=(TASK_AXES, 0, VIEW_AXES))(task, rows(state.memory, place.rank), view)
+            group = groups[place.group]
+            local, rank = jnp.asarray(place.local), jnp.asarray(place.rank)
+            able = events.able(group.event_time_s)[local]
+            done = done & able & (mission.phase_of[place.group][local] == number)
+            done_s = done_s.at[rank].min(jnp.where(done, now, jnp.inf))
+            rests = done & (group.around.height_m[local] < RESTING_HEIGHT_M)
+            groups[place.group] = replace(group, active=group.active.at[local].set(group.active[local] & ~rests))
+        phases.append(replace(state, done_s=done_s))
+    return replace(mission, phases=tuple(phases), world=replace(mission.world, groups=tuple(groups)))
+
+
+def _poses(mission: MissionState) -> tuple[Track, ...]:
+    return tuple(
+        Track(
+            position_m=g.vehicle.body.position_m,
+            quaternion=g.vehicle.body.quaternion,
+            velocity_m_s=g.vehicle.body.velocity_m_s,
+            energy_j=g.vehicle.energy_j,
+            active=g.active,
+        )
+        for g in mission.world.groups
+    )
+
+
+def _samples(mission: MissionState, after_s: jax.Array) -> tuple[Sampled | None, ...]:
+    """Exposures that ended after ``after_s`` []."""
+    found = []
+    for g in mission.world.groups:
+        if g.counter is None:
+            found.append(None)
+            continue
+        reading = g.counter.reading
+        found.append(
+            Sampled(
+                time_s=reading.time_s,
+                position_m=reading.position_m,
+                travel_m=reading.travel_m,
+                axis=reading.axis,
+                counts=reading.counts,
+                exposure_s=reading.exposure_s,
+                new=reading.valid & (reading.time_s > after_s),
+            )
+        )
+    return tuple(found)
+
+
+def _learned(world: World, plan: Plan, mission: MissionState, samples: tuple[Sampled | None, ...]) -> MissionState:
+    """The mission with the segment's counts in its windows and in the team's belief."""
+    windows, belief = list(mission.windows), mission.belief
+    reference = plan.detectors[0].background_cps if plan.detectors else None
+    for number, (group, sampled) in enumerate(zip(world.groups, samples, strict=True)):
+        if sampled is None or group.counter is None:
+            continue
+        held = windows[number]
+        if held is not None:
+            windows[number] = gather(held, _measurements(sampled), sampled.new, plan.per_window[number])
+        if belief is not None and plan.mapping is not None:
+            own = plan.detectors[group.counter.index].background_cps
+            size = jnp.where(reference > 0.0, own / jnp.maximum(reference, 1e-9), 1.0)
+            flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sampled)
+            belief = recursive_map.update(
+                plan.mapping, belief, flat.position_m, flat.counts, flat.exposure_s, flat.new,
+                jnp.broadcast_to(size, flat.counts.shape),
+            )  # fmt: skip
+    return replace(mission, windows=tuple(windows), belief=belief)
+
+
+def _measurements(sampled: Sampled) -> Measurements:
+    return Measurements(
+        time_s=sampled.time_s,
+        position_m=sampled.position_m,
+        travel_m=sampled.travel_m,
+        axis=sampled.axis,
+        counts=sampled.counts,
+        exposure_s=sampled.exposure_s,
+        valid=sampled.new,
+        detector=jnp.zeros(sampled.counts.shape, jnp.int32),
+    )
+
+
+def decide(world: World, plan: Plan, mission: MissionState) -> tuple[MissionState, Signals]:
+    """End phases, tell which ones are to begin, and whether the mission is over."""
+    now = now_of(mission, world.timing.control_period_s)
+    hotspot = _hotspot_known(plan, mission)
+    states = [_ended(world, plan, mission, number, now, hotspot) for number in range(len(plan.phases))]
+    phase_of = list(mission.phase_of)
+    for number, (phase, state) in enumerate(zip(plan.phases, states, strict=True)):
+        for place in phase.places:
+            leaves = jnp.isfinite(state.ended_s) & (phase_of[place.group] == number)
+            phase_of[place.group] = jnp.where(leaves, NO_PHASE, phase_of[place.group])
+    waiting = [~jnp.isfinite(state.began_s) for state in states]
+    first = [
+        wait & (now >= _trigger_time(phase.start, phase.start_s, states, hotspot, now))
+        for phase, wait, state in zip(plan.phases, waiting, states, strict=True)
+    ]
+    again = [_ask_again(world, phase, state, now) for phase, state in zip(plan.phases, states, strict=True)]
+    running = [~w & ~jnp.isfinite(s.ended_s) for w, s in zip(waiting, states, strict=True)]
+    to_come = [
+        w & jnp.isfinite(_trigger_time(p.start, p.start_s, states, hotspot, now))
+        for p, w in zip(plan.phases, waiting, strict=True)
+    ]
+    over = ~jnp.any(jnp.stack([*running, *to_come]))
+    over_s = jnp.where(over, jnp.minimum(mission.over_s, _last_end(states, now)), mission.over_s)
+    groups = tuple(replace(g, active=g.active & ~over) for g in mission.world.groups)
+    mission = replace(
+        mission,
+        phases=tuple(states),
+        phase_of=tuple(phase_of),
+        over_s=over_s,
+        world=replace(mission.world, groups=groups),
+    )
+    begin = jnp.stack([(f | a) & ~over for f, a in zip(first, again, strict=True)])
+    active = jnp.stack([jnp.any(g.active) for g in groups])
+    return mission, Signals(begin=begin, running=jnp.stack(running), active=active, over=over)
+
+
+def _hotspot_known(plan: Plan, mission: MissionState) -> jax.Array:
+    """Whether [] the belief shows a hotspot; asked only if a phase waits for one."""
+    triggers = [t for phase in plan.phases for t in (phase.start, phase.end) if t is not None]
+    if not any(t.kind == "when" for t in triggers) or plan.mapping is None or mission.belief is None:
+        return jnp.array(False)
+    chart = recursive_map.read(plan.mapping, mission.belief)
+    return extract_hotspots(plan.mapping, chart).valid[0]
+
+
+def _trigger_time(
+    trigger: Trigger, seconds: jax.Array, states: list[PhaseState], hotspot: jax.Array, now: jax.Array
+) -> jax.Array:
+    """When [] a trigger fires, as far as it is known now; inf: it depends on what has not happened."""
+    if trigger.kind == "at":
+        return seconds
+    if trigger.kind == "after":
+        return states[trigger.phase].ended_s + seconds
+    return jnp.where(hotspot, now, jnp.inf) + seconds
+
+
+def _ended(
+    world: World, plan: Plan, mission: MissionState, number: int, now: jax.Array, hotspot: jax.Array
+) -> PhaseState:
+    """The phase, ended if each of its vehicles is done or lost, or its time is up, or its end was triggered."""
+    phase, state = plan.phases[number], mission.phases[number]
+    lost_s, taken = jnp.full(phase.size, jnp.inf), jnp.zeros(phase.size, bool)
+    for place in phase.places:
+        local, rank = jnp.asarray(place.local), jnp.asarray(place.rank)
+        first = jnp.min(mission.world.groups[place.group].event_time_s[local], axis=-1)
+        lost_s = lost_s.at[rank].set(first)
+        taken = taken.at[rank].set(mission.phase_of[place.group][local] != number)
+    part_s = jnp.minimum(state.done_s, lost_s)
+    part_s = jnp.where(taken & ~jnp.isfinite(part_s), now, part_s)
+    complete = jnp.all(jnp.isfinite(part_s))
+    late = now - state.began_s >= phase.time_limit_s
+    cut = late
+    if phase.end is not None:
+        cut = cut | (now >= _trigger_time(phase.end, phase.end_s, list(mission.phases), hotspot, now))
+    ends = jnp.isfinite(state.began_s) & ~jnp.isfinite(state.ended_s) & (complete | cut)
+    when = jnp.where(complete, jnp.maximum(jnp.max(part_s), state.began_s), now)
+    return replace(
+        state,
+        ended_s=jnp.where(ends, when, state.ended_s),
+        in_time=state.in_time & ~(ends & late & ~complete),
+    )
+
+
+def _ask_again(world: World, phase: Phase, state: PhaseState, now: jax.Array) -> jax.Array:
+    """Whether [] a planner with a period is to be asked again."""
+    period = getattr(phase.policy.object, "period_s", None) if phase.plans else None
+    if not period:
+        return jnp.array(False)
+    running = jnp.isfinite(state.began_s) & ~jnp.isfinite(state.ended_s)
+    return running & (now - state.asked_s >= period - 0.5 * world.timing.control_period_s)
+
+
+def _last_end(states: list[PhaseState], now: jax.Array) -> jax.Array:
+    """When [] the last phase ended."""
+    ends = jnp.stack([state.ended_s for state in states])
+    ended = jnp.isfinite(ends)
+    return jnp.where(jnp.any(ended), jnp.max(jnp.where(ended, ends, 0.0)), now)
+
+
+__all__ = ["decide", "segment"]

@@ -1,0 +1,307 @@
+"""One mission out of a batch, as the record on the host that files, figures and recordings are made from."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from swarmsim.estimation import SourceFit
+from swarmsim.missions.state import MissionState, Sampled
+from swarmsim.results.record import (
+    Estimate,
+    Event,
+    MissionRecord,
+    Phase,
+    RadiationMap,
+    Samples,
+    Sought,
+    Spectrum,
+    TrueSource,
+    VehicleRecord,
+)
+from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
+from swarmsim.runtime.simulation import MissionBatch, Segment, Simulation
+from swarmsim.world.model import World
+
+NOTHING_SOUGHT = "nothing was sought"
+NOTHING_FOUND = "no source above background"
+SAMPLE = ("time_s", "position_m", "counts", "exposure_s")
+"""Columns that samples have in common with readings."""
+CROWDED = "more vehicles were in one place than the neighbour search holds: a collision may have gone unnoticed"
+
+
+def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> MissionRecord:
+    """Mission number ``index`` of a batch."""
+    end = _row(batch.end, index)
+    phases = _phases(simulation, end)
+    tracks = [_tracks(batch, index, group) for group in range(len(simulation.world.groups))]
+    vehicles = [_vehicle(simulation, tracks, end, number) for number in range(len(simulation.scenario.members))]
+    conclusion = None if batch.conclusion is None else _row(batch.conclusion, index)
+    found = conclusion is not None and bool(conclusion.survey.found)
+    nuclides = _nuclides(simulation)
+    survey_estimate = estimate = spectrum = None
+    if found and conclusion is not None:
+        presumed = int(simulation.plan.presumed_nuclide)
+        survey_estimate = _estimate(conclusion.survey.fit, nuclides[presumed])
+        estimate = _estimate(conclusion.fit, nuclides[int(conclusion.nuclide)])
+        spectrum = _spectrum(simulation, conclusion)
+    return MissionRecord(
+        name=simulation.scenario.mission.name,
+        site=simulation.site_model.name,
+        seed=int(batch.seeds[index]),
+        phases=tuple(phases),
+        vehicles=tuple(vehicles),
+        samples=_samples(simulation, batch, index, phases),
+        sought=_sought(simulation),
+        map=None if conclusion is None else _map(simulation, conclusion.survey),
+        survey_estimate=survey_estimate,
+        surveyed_s=_surveyed_s(simulation, end),
+        estimate=estimate,
+        spectrum=spectrum,
+        sources=true_sources(simulation, batch.worlds.of(index)),
+        paths_m=_paths(simulation, end),
+        events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
+        finding=_finding(conclusion is not None, estimate, spectrum, _no_way(simulation, end)),
+        warnings=(CROWDED,) if bool(end.world.crowded) else (),
+    )
+
+
+def _row(tree: Any, index: int) -> Any:
+    """One mission's part of a pytree with the mission axis, on the host; keys of randomness are left out."""
+
+    def take(leaf: Any) -> Any:
+        return None if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key) else np.asarray(leaf)[index]
+
+    return jax.tree.map(take, tree)
+
+
+def _phases(simulation: Simulation, end: MissionState) -> list[Phase]:
+    """The phases that began."""
+    scenario, over = simulation.scenario, float(end.over_s)
+    return [
+        Phase(
+            name=spec.name,
+            policy=spec.policy,
+            vehicles=tuple(members),
+            start_s=float(state.began_s),
+            end_s=float(state.ended_s) if np.isfinite(state.ended_s) else over,
+            in_time=bool(state.in_time),
+        )
+        for spec, members, state in zip(scenario.mission.phases, scenario.phase_members, end.phases, strict=True)
+        if np.isfinite(state.began_s)
+    ]
+
+
+def _vehicle(
+    simulation: Simulation, tracks: list[dict[str, np.ndarray]], end: MissionState, number: int
+) -> VehicleRecord:
+    """One vehicle; its track has a pose before it first moved, and one after it came to rest, or all until the end."""
+    group, local = place_of(simulation, number)
+    times = end.world.groups[group].event_time_s[local]
+    of_group = tracks[group]
+    if not of_group:
+        return vehicle_record(simulation, number, _never_moved(end, group, local), times)
+    track = {name: values if name == "time_s" else values[:, local] for name, values in of_group.items()}
+    rows = np.flatnonzero(track.pop("active"))
+    first, last = (0, 1) if not len(rows) else (rows[0], rows[-1] + 2)
+    if np.isfinite(times).any():
+        last = int(np.searchsorted(track["time_s"], end.over_s)) + 1  # other missions of the batch may go on
+    span = slice(first, last)
+    return vehicle_record(simulation, number, {name: values[span] for name, values in track.items()}, times)
+
+
+def _tracks(batch: MissionBatch, index: int, group: int) -> dict[str, np.ndarray]:
+    """Times [T] and tracks [T, U, …] of a group; empty where it was never stepped."""
+    logged = [(s.log.time_s, track) for s in batch.segments if (track := s.log.tracks[group]) is not None]
+    if not logged:
+        return {}
+    found = {"time_s": np.concatenate([np.asarray(time_s)[index] for time_s, _ in logged])}
+    for name in (*TRACK, "active"):
+        found[name] = np.concatenate([np.asarray(getattr(track, name))[index] for _, track in logged])
+    return found
+
+
+def _never_moved(end: MissionState, group: int, local: int) -> dict[str, np.ndarray]:
+    """The track of a vehicle whose group was never stepped: one pose."""
+    vehicle = end.world.groups[group].vehicle
+    pose = {name: getattr(vehicle.body, name)[local][None] for name in ("position_m", "quaternion", "velocity_m_s")}
+    return pose | {"time_s": np.zeros(1), "energy_j": vehicle.energy_j[local][None]}
+
+
+def _samples(simulation: Simulation, batch: MissionBatch, index: int, phases: list[Phase]) -> Samples:
+    """All valid readings in the order of time."""
+    found: list[dict[str, np.ndarray]] = []
+    for g, group in enumerate(simulation.world.groups):
+        for sampled in _of_group(batch.segments, g):
+            new = np.asarray(sampled.new)[index]
+            rows = {name: np.asarray(getattr(sampled, name))[index][new] for name in SAMPLE}
+            rows["vehicle"] = np.broadcast_to(np.asarray(group.member, np.int32), new.shape)[new]
+            found.append(rows)
+    return samples_of(found, phases)
+
+
+def samples_of(found: Sequence[Mapping[str, np.ndarray]], phases: Sequence[Phase]) -> Samples:
+    """Samples in the order of time, from parts with the columns `SAMPLE` and ``vehicle``."""
+    if not found:
+        nothing = np.zeros(0)
+        return Samples(np.zeros(0, np.int32), np.zeros(0, str), nothing, np.zeros((0, 3)), nothing, nothing, nothing)
+    joined = {name: np.concatenate([rows[name] for rows in found]) for name in found[0]}
+    order = np.argsort(joined["time_s"], kind="stable")
+    rows = {name: values[order] for name, values in joined.items()}
+    return Samples(
+        phase=_phase_names(rows["vehicle"], rows["time_s"], phases),
+        count_rate_cps=rows["counts"] / rows["exposure_s"],
+        **rows,
+    )
+
+
+def _of_group(segments: Iterable[Segment], group: int) -> Iterable[Sampled]:
+    return (found for segment in segments if (found := segment.log.samples[group]) is not None)
+
+
+def _phase_names(vehicle: np.ndarray, time_s: np.ndarray, phases: Sequence[Phase]) -> np.ndarray:
+    """Name of the phase [n] that a vehicle was in: of those that it has a part in, the one that began last."""
+    names = np.full(len(vehicle), "", dtype=f"<U{max([1, *(len(p.name) for p in phases)])}")
+    for phase in sorted(phases, key=lambda p: p.start_s):
+        names[np.isin(vehicle, phase.vehicles) & (time_s > phase.start_s)] = phase.name
+    return names
+
+
+def _events(simulation: Simulation, end: MissionState, phases: list[Phase]) -> list[Event]:
+    """What ended vehicles, what each phase's vehicles finished, and who ran out of time."""
+    members = simulation.scenario.members
+    found, lost = [], set()
+    for number, member in enumerate(members):
+        group, local = place_of(simulation, number)
+        ended = losses(member.name, end.world.groups[group].event_time_s[local])
+        found += ended
+        if ended:
+            lost.add(number)
+    states = dict(zip((p.name for p in simulation.scenario.mission.phases), end.phases, strict=True))
+    for phase in phases:
+        for number, done_s in zip(phase.vehicles, states[phase.name].done_s, strict=True):
+            name = members[number].name
+            if np.isfinite(done_s):
+                found.append(Event(float(done_s), name, "finished", f"had done its part of phase {phase.name}"))
+            elif number not in lost and not phase.in_time:
+                found.append(Event(phase.end_s, name, "time_limit", f"had not done its part of phase {phase.name}"))
+    return found
+
+
+def _paths(simulation: Simulation, end: MissionState) -> dict[int, np.ndarray]:
+    found: dict[int, np.ndarray] = {}
+    for members, state in zip(simulation.scenario.phase_members, end.phases, strict=True):
+        if state.path is not None and np.isfinite(state.began_s):
+            found |= dict(zip(members, state.path.points_m, strict=True))
+    return found
+
+
+def _map(simulation: Simulation, survey: Any) -> RadiationMap:
+    mapping = simulation.plan.mapping
+    assert mapping is not None
+    return RadiationMap(
+        origin_m=np.asarray(mapping.origin_m),
+        cell_m=float(mapping.cell_m),
+        mean_cps=survey.map.mean_cps,
+        std_cps=survey.map.std_cps,
+        hotspots_m=survey.hotspots.position_m[survey.hotspots.valid],
+    )
+
+
+def _nuclides(simulation: Simulation) -> tuple[str, ...]:
+    """The library's nuclides, in the order of their indices."""
+    return simulation.plan.detectors[0].nuclide_names if simulation.plan.detectors else ()
+
+
+def _estimate(fit: SourceFit, nuclide: str) -> Estimate:
+    return Estimate(
+        position_m=np.asarray(fit.position_m),
+        covariance_m2=np.asarray(fit.covariance_m2),
+        activity_mbq=float(fit.activity_bq) * 1e-6,
+        activity_std_mbq=float(fit.activity_std_bq) * 1e-6,
+        background_scale=float(fit.background_scale),
+        nuclide=nuclide,
+    )
+
+
+def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
+    """The spectrum of the source, where one was taken; none was if nobody measured near it."""
+    answer = conclusion.identification
+    if answer is None or float(conclusion.spectrum.live_s) <= 0.0:
+        return None
+    detector, names = simulation.plan.detectors[simulation.plan.spectrometer], _nuclides(simulation)
+    live, index = float(conclusion.spectrum.live_s), int(answer.nuclide)
+    lines = simulation.scenario.nuclides[names[index]].lines if index >= 0 else ()
+    return Spectrum(
+        energy_kev=np.asarray(detector.energy_kev),
+        counts=conclusion.spectrum.counts,
+        background=np.asarray(detector.background_spectrum) * live,
+        fit=answer.fit,
+        live_time_s=live,
+        nuclide=names[index] if index >= 0 else "none",
+        confidence=float(answer.confidence),
+        scores=dict(zip(names, map(float, answer.posterior), strict=True)),
+        lines_kev=np.array([line.energy_kev for line in lines]),
+    )
+
+
+def true_sources(simulation: Simulation, world: World) -> tuple[TrueSource, ...]:
+    """The sources of one mission's world, whatever values it was given."""
+    sources, names = world.sources, _nuclides(simulation)
+    return tuple(
+        TrueSource(
+            nuclide=names[int(sources.nuclide[k])] if names else spec.nuclide,
+            position_m=np.asarray(sources.position_m[k], float),
+            activity_mbq=1e-6 * float(sources.activity_bq[k]),
+        )
+        for k, spec in enumerate(simulation.scenario.mission.sources)
+    )
+
+
+def _sought(simulation: Simulation) -> Sought:
+    plan = simulation.plan
+    if plan.mapping is None or plan.localisation is None:
+        return "nothing"
+    return "source" if plan.spectrometer < 0 else "nuclide"
+
+
+def _surveyed_s(simulation: Simulation, end: MissionState) -> float:
+    """When the last phase that went by the survey's estimate asked for it; else the end, when all counts are in it."""
+    asked = [
+        float(state.asked_s)
+        for phase, state in zip(simulation.plan.phases, end.phases, strict=True)
+        if phase.target == "source" and np.isfinite(state.asked_s)
+    ]
+    return max(asked, default=float(end.over_s))
+
+
+def _no_way(simulation: Simulation, end: MissionState) -> bool:
+    """Whether rovers were sent to the source, and none had a drivable way there: their paths have no extent."""
+    scenario = simulation.scenario
+    drives = [
+        bool(np.ptp(points[:, :2], axis=0).max() > 0.0)
+        for phase, members, state in zip(simulation.plan.phases, scenario.phase_members, end.phases, strict=True)
+        if phase.target == "source" and state.path is not None and np.isfinite(state.began_s)
+        for number, points in zip(members, state.path.points_m, strict=True)
+        if scenario.vehicles[number].kind == "skid_steer"
+    ]
+    return bool(drives) and not any(drives)
+
+
+def _finding(sought: bool, estimate: Estimate | None, spectrum: Spectrum | None, no_way: bool) -> str:
+    if not sought:
+        return NOTHING_SOUGHT
+    if estimate is None:
+        return NOTHING_FOUND
+    x, y = estimate.position_m[:2]
+    place = f"a source of {estimate.activity_mbq:.0f} MBq {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
+    if no_way:
+        return f"{place}; nuclide presumed, no drivable way for the rover to reach it"
+    if spectrum is None:
+        return f"{place}; nuclide presumed, no spectrum was taken near it"
+    if spectrum.nuclide == "none":
+        return f"{place}; nuclide presumed, the spectrum shows none"
+    if spectrum.nuclide != estimate.nuclide:
+        return f"{place}; nuclide presumed, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
+    return f"{place}; identified with {spectrum.confidence:.1%}"

@@ -1,0 +1,10 @@
+"""Names of the files of a run."""
+
+SCENARIO = "scenario.yaml"
+SUMMARY = "summary.json"
+MISSIONS = "missions.parquet"
+MEASUREMENTS = "measurements.parquet"
+TRAJECTORIES = "trajectories.parquet"
+MAP = "radiation_map.npz"
+RECORDING = "mission.rrd"
+FIGURES = "figures"

@@ -1,0 +1,193 @@
+"""What one flown mission leaves behind, as numpy arrays on the host: the input of all that is written or shown."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+Sought = Literal["nothing", "source", "nuclide"]
+"""What a mission was to find; nuclide: a source with its nuclide."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened to a vehicle."""
+
+    time_s: float
+    vehicle: str
+    kind: (
+        str  # one of `swarmsim.world.events.KINDS`, which end its part; finished or time_limit for its part in a phase
+    )
+    detail: str
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What a vehicle looks like, as far as a picture needs it: a box with discs (rotors or wheels). Body frame FLU."""
+
+    hubs_m: Floats  # [k, 3] centres of the rotors or wheels
+    radius_m: float  # of a rotor or wheel
+    width_m: float  # of a wheel; 0 for a rotor
+    box_centre_m: Floats  # [3]
+    box_size_m: Floats  # [3] length, width, height
+
+
+@dataclass(frozen=True)
+class VehicleRecord:
+    """The track of one vehicle at the logging rate; world ENU, quaternion w x y z body (FLU) to world."""
+
+    name: str
+    type: str
+    kind: str  # multirotor | skid_steer
+    time_s: Floats  # [n]
+    position_m: Floats  # [n, 3]
+    quaternion: Floats  # [n, 4]
+    velocity_m_s: Floats  # [n, 3]
+    energy_wh: Floats  # [n] used since the start
+    battery_fraction: Floats  # [n] left, 0 to 1
+    crashed: bool
+    shape: Shape | None = None  # None: drawn as a generic body of its kind
+
+    @property
+    def flies(self) -> bool:
+        """Whether it leaves the ground."""
+        return self.kind == "multirotor"
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Detector measurements of all vehicles in time order."""
+
+    vehicle: NDArray[np.int32]  # [n] index into MissionRecord.vehicles
+    phase: NDArray[np.str_]  # [n] name of the phase that the vehicle was in
+    time_s: Floats  # [n] end of the counting interval
+    position_m: Floats  # [n, 3] of the crystal
+    counts: Floats  # [n]
+    exposure_s: Floats  # [n] live interval that the counts stand for
+    count_rate_cps: Floats  # [n] counts / exposure
+
+    def rows(self, index: NDArray[Any] | slice) -> "Samples":
+        """Those that ``index`` chooses, in its order."""
+        return Samples(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
+
+    def of_phase(self, phase: str) -> "Samples":
+        """Those of one phase."""
+        return self.rows(self.phase == phase)
+
+    def until(self, time_s: float) -> "Samples":
+        """Those that had ended at ``time_s``."""
+        return self.rows(slice(int(np.searchsorted(self.time_s, time_s, "right"))))
+
+
+@dataclass(frozen=True)
+class RadiationMap:
+    """Interpolated count rate on a grid; row 0 is the south edge, column 0 the west edge."""
+
+    origin_m: Floats  # [2] centre of cell [0, 0]
+    cell_m: float
+    mean_cps: Floats  # [ny, nx]
+    std_cps: Floats  # [ny, nx]
+    hotspots_m: Floats  # [h, 2] strongest first
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A source estimate with its uncertainty (one standard deviation, from the Fisher information)."""
+
+    position_m: Floats  # [3]
+    covariance_m2: Floats  # [3, 3]
+    activity_mbq: float
+    activity_std_mbq: float
+    background_scale: float  # estimated background over the detector's nominal one
+    nuclide: str  # hypothesis under which it was fitted
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """The spectrum accumulated near the source, and what was read from it."""
+
+    energy_kev: Floats  # [c] channel centres
+    counts: Floats  # [c]
+    background: Floats  # [c] expected background counts in the same live time
+    fit: Floats  # [c] fitted counts of the best nuclide plus background
+    live_time_s: float
+    nuclide: str  # "none" where no nuclide explains the counts
+    confidence: float
+    scores: dict[str, float]  # posterior of every candidate nuclide
+    lines_kev: Floats = field(default_factory=lambda: np.zeros(0))  # [l] gamma lines of the named nuclide, for labels
+
+
+@dataclass(frozen=True)
+class TrueSource:
+    """Ground truth of one source."""
+
+    nuclide: str
+    position_m: Floats  # [3]
+    activity_mbq: float
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A phase of the mission: who was in it, and its simulated time span."""
+
+    name: str
+    policy: str
+    vehicles: tuple[int, ...]  # indices into MissionRecord.vehicles
+    start_s: float
+    end_s: float
+    in_time: bool  # it was not cut off by its time limit
+
+
+@dataclass(frozen=True)
+class MissionRecord:
+    """One mission, whole. What it did not find, or was not to look for, is None."""
+
+    name: str
+    site: str
+    seed: int
+    phases: tuple[Phase, ...]  # those that began, in the order of the scenario
+    vehicles: tuple[VehicleRecord, ...]
+    samples: Samples
+    sought: Sought
+    map: RadiationMap | None  # of the counts until ``surveyed_s``
+    survey_estimate: Estimate | None  # from the same counts; the last one that a phase went by
+    surveyed_s: float  # when both were made
+    estimate: Estimate | None  # from all counts
+    spectrum: Spectrum | None
+    sources: tuple[TrueSource, ...]
+    paths_m: dict[int, Floats]  # last planned path [r, 3] of a vehicle by its index
+    events: tuple[Event, ...]
+    finding: str  # one sentence: what the mission found
+    warnings: tuple[str, ...] = ()  # what makes parts of the result doubtful
+
+    def phase(self, name: str) -> Phase | None:
+        """The phase of a name; None where it did not begin."""
+        return next((phase for phase in self.phases if phase.name == name), None)
+
+    def is_flown(self, phase: Phase) -> bool:
+        """Whether a vehicle of the phase flies."""
+        return any(self.vehicles[number].flies for number in phase.vehicles)
+
+    @property
+    def start_s(self) -> float:
+        """When the first phase began."""
+        return min((phase.start_s for phase in self.phases), default=0.0)
+
+    @property
+    def end_s(self) -> float:
+        """When the last phase ended."""
+        return max((phase.end_s for phase in self.phases), default=0.0)
+
+    def finite(self) -> "MissionRecord":
+        """The mission without rows that are not finite: what a vehicle lost to a numerical failure left behind."""
+        vehicles = []
+        for vehicle in self.vehicles:
+            state = np.concatenate([vehicle.position_m, vehicle.quaternion, vehicle.velocity_m_s], axis=1)
+            keep = np.isfinite(state).all(axis=1) & np.isfinite(vehicle.energy_wh)
+            columns = ("time_s", "position_m", "quaternion", "velocity_m_s", "energy_wh", "battery_fraction")
+            vehicles.append(replace(vehicle, **{name: getattr(vehicle, name)[keep] for name in columns}))
+        samples = self.samples
+        whole = np.isfinite(samples.position_m).all(axis=1) & np.isfinite(samples.counts)
+        return replace(self, vehicles=tuple(vehicles), samples=samples.rows(whole))

@@ -1,0 +1,165 @@
+"""A run on disk: ``runs/<name>/`` is complete or absent, whatever happens while it is written."""
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from swarmsim.atomic_folder import atomic_folder
+from swarmsim.config.scenario import Scenario
+from swarmsim.playback import figures
+from swarmsim.playback.recording import write_recording
+from swarmsim.results import names
+from swarmsim.results.out_folder import check_out
+from swarmsim.results.record import MissionRecord, RadiationMap
+from swarmsim.results.summary import Timings, all_keys, batch_row, batch_summary, summary
+from swarmsim.site.model import SiteModel
+
+_FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x y z, body (forward left up) to world"
+
+
+class Built(Protocol):
+    """What the files say of a simulation."""
+
+    scenario: Scenario
+    site_model: SiteModel
+
+
+def write_run(
+    simulation: Built,
+    records: Sequence[MissionRecord],
+    out: Path | str,
+    timings: Timings | None = None,
+    *,
+    force: bool = False,
+) -> dict[str, Any]:
+    """Write all files of a run to the folder ``out`` and return its summary.
+
+    Of a batch, every mission has a row in ``missions.parquet``; tables, map, recording and figures are the first
+    mission's (any other can be flown again from its seed). A mission that makes no map has no ``radiation_map.npz``.
+    The time for writing is measured here.
+
+    Args:
+        simulation: whose missions these are.
+        records: of one mission or more.
+        out: folder, which must not exist unless ``force`` is given.
+        timings: of compilation and rollouts; without them the summary has no real-time factor.
+        force: replace an earlier run.
+
+    Raises:
+        InputError: ``out`` cannot be used. On any error or Ctrl-C nothing of the new run is left, and an earlier one
+            still stands.
+    """
+    timings = Timings() if timings is None else timings
+    with atomic_folder(Path(out), partial(check_out, force=force)) as folder:
+        started = time.perf_counter()
+        (folder / names.SCENARIO).write_text(simulation.scenario.to_yaml(), encoding="utf-8")
+        first = records[0]
+        pq.write_table(measurements_table(first), folder / names.MEASUREMENTS, compression="zstd")
+        pq.write_table(trajectories_table(first), folder / names.TRAJECTORIES, compression="zstd")
+        if first.map is not None:
+            _write_map(first.map, folder / names.MAP)
+        write_recording(first, simulation.site_model, folder / names.RECORDING)
+        figures.write(first, simulation.site_model, folder / names.FIGURES)
+        rows = [batch_row(record) for record in records] if len(records) > 1 else []
+        if rows:
+            pq.write_table(missions_table(rows), folder / names.MISSIONS, compression="zstd")
+        timed = replace(timings, write_s=time.perf_counter() - started)
+        content = _finite(batch_summary(rows, records, timed) if rows else summary(first, timed))
+        text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+        (folder / names.SUMMARY).write_text(text + "\n", encoding="utf-8")
+    return content
+
+
+def _finite(value: Any) -> Any:
+    """``value`` with None for numbers that are not finite, which JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _metadata(record: MissionRecord, what: str) -> dict[str, str]:
+    return {"content": what, "mission": record.name, "site": record.site, "seed": str(record.seed), "frame": _FRAME}
+
+
+def _dictionary(texts: Sequence[str], index: np.ndarray) -> pa.DictionaryArray:
+    return pa.DictionaryArray.from_arrays(pa.array(index, pa.int32()), pa.array(list(texts), pa.string()))
+
+
+def measurements_table(record: MissionRecord) -> pa.Table:
+    """Every detector sample, in time order: one row each, units in the column names."""
+    samples = record.samples
+    phases, index = np.unique(samples.phase, return_inverse=True)
+    columns = {
+        "vehicle": _dictionary([v.name for v in record.vehicles], samples.vehicle),
+        "phase": _dictionary([str(p) for p in phases], index),
+        "time_s": samples.time_s.astype(np.float64),
+        "east_m": samples.position_m[:, 0].astype(np.float32),
+        "north_m": samples.position_m[:, 1].astype(np.float32),
+        "up_m": samples.position_m[:, 2].astype(np.float32),
+        "counts": samples.counts.astype(np.float32),
+        "exposure_s": samples.exposure_s.astype(np.float32),
+        "count_rate_cps": samples.count_rate_cps.astype(np.float32),
+    }
+    return pa.table(
+        columns, metadata=_metadata(record, "detector samples; position is the crystal's, time the end of a count")
+    )
+
+
+def trajectories_table(record: MissionRecord) -> pa.Table:
+    """The tracks of all vehicles, one after the other: one row for each logged time."""
+    vehicles = record.vehicles
+    lengths = [len(v.time_s) for v in vehicles]
+
+    def column(values: list[np.ndarray], kind: type = np.float32) -> np.ndarray:
+        return np.concatenate(values).astype(kind)
+
+    columns: dict[str, Any] = {
+        "vehicle": _dictionary([v.name for v in vehicles], np.repeat(np.arange(len(vehicles)), lengths)),
+        "time_s": column([v.time_s for v in vehicles], np.float64),
+    }
+    for k, axis in enumerate(("east", "north", "up")):
+        columns[f"{axis}_m"] = column([v.position_m[:, k] for v in vehicles])
+    for k, part in enumerate("wxyz"):
+        columns[f"quaternion_{part}"] = column([v.quaternion[:, k] for v in vehicles])
+    for k, axis in enumerate(("east", "north", "up")):
+        columns[f"velocity_{axis}_m_s"] = column([v.velocity_m_s[:, k] for v in vehicles])
+    columns["energy_wh"] = column([v.energy_wh for v in vehicles])
+    columns["battery_fraction"] = column([v.battery_fraction for v in vehicles])
+    return pa.table(columns, metadata=_metadata(record, "vehicle tracks"))
+
+
+def missions_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
+    """One row for each mission, with the columns of all rows; all-null columns stay numeric."""
+    columns = {}
+    for key in all_keys(rows):
+        values = [row.get(key) for row in rows]
+        empty = all(v is None for v in values)
+        columns[key] = (
+            pa.array(values, pa.string() if key == "nuclide" else pa.float64()) if empty else pa.array(values)
+        )
+    return pa.table(columns)
+
+
+def _write_map(made: RadiationMap, path: Path) -> None:
+    """The radiation map with its axes; row 0 is the south edge."""
+    ny, nx = made.mean_cps.shape
+    np.savez_compressed(
+        path,
+        mean_cps=made.mean_cps,
+        std_cps=made.std_cps,
+        east_m=made.origin_m[0] + made.cell_m * np.arange(nx),
+        north_m=made.origin_m[1] + made.cell_m * np.arange(ny),
+        cell_m=made.cell_m,
+        hotspots_m=made.hotspots_m,
+    )

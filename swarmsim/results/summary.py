@@ -1,0 +1,294 @@
+"""What a mission found and how far it was from the truth, in plain numbers: one mission's summary, and a batch's."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmsim.results.record import (
+    Estimate,
+    Event,
+    MissionRecord,
+    Phase,
+    RadiationMap,
+    Spectrum,
+    TrueSource,
+    VehicleRecord,
+)
+from swarmsim.versions import package_versions
+
+_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "rerun-sdk")
+_ESTIMATE_KEYS = (
+    "position_m",
+    "position_std_m",
+    "error_m",
+    "error_horizontal_m",
+    "activity_mbq",
+    "activity_std_mbq",
+    "activity_error_percent",
+    "background_scale",
+)
+INTACT = "intact"
+STATES = {
+    "crash": "crashed",
+    "obstacle": "collided with an obstacle",
+    "vehicle": "collided with a vehicle",
+    "battery_empty": "battery empty",
+    "non_finite": "numerically unstable",
+}
+"""State of a vehicle in which an event of each kind leaves it."""
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Wall-clock seconds: compilation, the rollouts of the whole batch, and writing the files."""
+
+    compile_s: float = 0.0
+    run_s: float = 0.0
+    write_s: float = 0.0
+
+
+def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
+    """One mission's summary as plain JSON values; None where the mission found nothing or looked for nothing.
+
+    Errors are distances to the nearest true source: of the hotspot on the map (horizontal), of the source in space.
+    """
+    record = record.finite()
+    hotspot = _hotspot(record.map)
+    spectrum = record.spectrum
+    return {
+        "name": record.name,
+        "site": record.site,
+        "seed": int(record.seed),
+        "finding": record.finding,
+        "warnings": list(record.warnings),
+        "success": succeeded(record),
+        "phases": {phase.name: phase_summary(record, phase) for phase in record.phases},
+        "hotspot": {
+            "position_m": None if hotspot is None else _plain(hotspot),
+            "error_m": None if hotspot is None else _nearest(hotspot, record.sources)[1],
+        },
+        "survey_estimate": estimate_summary(record.survey_estimate, record.sources),
+        "source": estimate_summary(record.estimate, record.sources),
+        "nuclide": {
+            "name": named(spectrum),
+            "confidence": None if spectrum is None else float(spectrum.confidence),
+        },
+        "true_sources": [
+            {"nuclide": s.nuclide, "position_m": _plain(s.position_m), "activity_mbq": float(s.activity_mbq)}
+            for s in record.sources
+        ],
+        "vehicles": [
+            {
+                "name": v.name,
+                "type": v.type,
+                "state": state_of(record, v),
+                "crashed": bool(v.crashed),
+                "energy_wh": energy_wh(v),
+            }
+            for v in record.vehicles
+        ],
+        "events": [event_summary(e) for e in record.events],
+        "real_time_factor": real_time_factor([record], timings),
+        "timing": timing_summary(timings),
+        "versions": versions(),
+    }
+
+
+def event_summary(event: Event) -> dict[str, Any]:
+    """An event as plain JSON values; no time where it has none of its own."""
+    time_s = float(event.time_s) if np.isfinite(event.time_s) else None
+    return {"time_s": time_s, "vehicle": event.vehicle, "kind": event.kind, "detail": event.detail}
+
+
+def state_of(record: MissionRecord, vehicle: VehicleRecord) -> str:
+    """State of a vehicle at the end: `INTACT`, or one of `STATES`."""
+    kinds = (event.kind for event in record.events if event.vehicle == vehicle.name and event.kind in STATES)
+    return next((STATES[kind] for kind in kinds), INTACT)
+
+
+def phase_summary(record: MissionRecord, phase: Phase) -> dict[str, Any]:
+    """A phase as plain JSON values: how far its vehicles went together (m) during it, and what they counted in it."""
+    return {
+        "policy": phase.policy,
+        "vehicles": [record.vehicles[number].name for number in phase.vehicles],
+        "start_s": float(phase.start_s),
+    } | _measured(record, phase)
+
+
+def _measured(record: MissionRecord, phase: Phase) -> dict[str, Any]:
+    """The numbers of a phase that missions of a batch may differ in."""
+    rates = record.samples.of_phase(phase.name).count_rate_cps
+    return {
+        "duration_s": float(phase.end_s - phase.start_s),
+        "in_time": bool(phase.in_time),
+        "path_length_m": sum(_length(record.vehicles[number], phase) for number in phase.vehicles),
+        "measurements": len(rates),
+        "count_rate_min_cps": float(rates.min()) if len(rates) else None,
+        "count_rate_max_cps": float(rates.max()) if len(rates) else None,
+    }
+
+
+def _length(vehicle: VehicleRecord, phase: Phase) -> float:
+    """Length of a vehicle's track during a phase, in m."""
+    inside = (vehicle.time_s >= phase.start_s) & (vehicle.time_s <= phase.end_s)
+    track = np.asarray(vehicle.position_m[inside], float)
+    return float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
+
+
+def _hotspot(made: RadiationMap | None) -> NDArray[np.floating] | None:
+    """The strongest hotspot [2] of a map."""
+    return None if made is None or not len(made.hotspots_m) else np.asarray(made.hotspots_m[0], float)
+
+
+def estimate_summary(estimate: Estimate | None, sources: tuple[TrueSource, ...]) -> dict[str, Any]:
+    """An estimate with its standard deviations and its errors against the nearest true source.
+
+    ``error_m`` is the distance in space, ``error_horizontal_m`` the distance on the map; ``activity_error_percent`` is
+    the size of the error over the true activity.
+    """
+    if estimate is None:
+        return dict.fromkeys(_ESTIMATE_KEYS)
+    position = np.asarray(estimate.position_m, float)
+    nearest, error = _nearest(position, sources)
+    activity = float(estimate.activity_mbq)
+    values = (
+        _plain(position),
+        _plain(np.sqrt(np.maximum(np.diag(estimate.covariance_m2), 0.0))),
+        error,
+        _nearest(position[:2], sources)[1],
+        activity,
+        float(estimate.activity_std_mbq),
+        None
+        if nearest is None or nearest.activity_mbq <= 0.0
+        else 100.0 * abs(activity - float(nearest.activity_mbq)) / float(nearest.activity_mbq),
+        float(estimate.background_scale),
+    )
+    return dict(zip(_ESTIMATE_KEYS, values, strict=True))
+
+
+def _nearest(
+    position_m: NDArray[np.floating], sources: tuple[TrueSource, ...]
+) -> tuple[TrueSource | None, float | None]:
+    """The true source nearest to ``position_m`` [2 or 3] and its distance; None where the mission has no source."""
+    if not sources:
+        return None, None
+    size = len(position_m)
+    distances = [float(np.linalg.norm(np.asarray(s.position_m, float)[:size] - position_m)) for s in sources]
+    best = int(np.argmin(distances))
+    return sources[best], distances[best]
+
+
+def energy_wh(vehicle: VehicleRecord) -> float:
+    """Energy that a vehicle used in all, 0 where it has no track."""
+    return float(vehicle.energy_wh[-1]) if len(vehicle.energy_wh) else 0.0
+
+
+def named(spectrum: Spectrum | None) -> str | None:
+    """The nuclide that a spectrum names, if it names one."""
+    return None if spectrum is None or spectrum.nuclide == "none" else spectrum.nuclide
+
+
+def _plain(values: NDArray[np.floating]) -> list[float]:
+    return [float(v) for v in values]
+
+
+def real_time_factor(records: Sequence[MissionRecord], timings: Timings) -> float | None:
+    """Simulated seconds of all missions over the wall seconds of their rollouts."""
+    simulated = sum(record.end_s for record in records)
+    return float(simulated / timings.run_s) if timings.run_s > 0.0 else None
+
+
+def timing_summary(timings: Timings) -> dict[str, float]:
+    """The timings as plain JSON values."""
+    return {"compile_s": float(timings.compile_s), "run_s": float(timings.run_s), "write_s": float(timings.write_s)}
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on."""
+    return package_versions(_PACKAGES)
+
+
+def batch_row(record: MissionRecord) -> dict[str, Any]:
+    """One mission as a flat row of ``missions.parquet``, units in the names: what `batch_summary` sums up.
+
+    A phase that did not begin has no columns.
+    """
+    record = record.finite()
+    row: dict[str, Any] = {"seed": int(record.seed), "finding": record.finding}
+    for phase in record.phases:
+        row |= {f"{phase.name}_{key}": value for key, value in _measured(record, phase).items()}
+    row["duration_s"] = float(record.end_s)
+    hotspot = _hotspot(record.map)
+    row |= _axes("hotspot", None if hotspot is None else _plain(hotspot), ("east_m", "north_m"))
+    row["hotspot_error_m"] = None if hotspot is None else _nearest(hotspot, record.sources)[1]
+    for name, estimate in (("survey_estimate", record.survey_estimate), ("source", record.estimate)):
+        values = estimate_summary(estimate, record.sources)
+        row |= _axes(name, values.pop("position_m"), ("east_m", "north_m", "up_m"))
+        row |= _axes(name, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
+        row |= {f"{name}_{key}": value for key, value in values.items()}
+    row["nuclide"] = named(record.spectrum)
+    row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
+    row["crashed"] = sum(bool(v.crashed) for v in record.vehicles)
+    row["energy_wh"] = sum(energy_wh(v) for v in record.vehicles)
+    row["success"] = succeeded(record)
+    return row
+
+
+def _axes(name: str, values: list[float] | None, axes: tuple[str, ...]) -> dict[str, float | None]:
+    return {f"{name}_{axis}": None if values is None else values[k] for k, axis in enumerate(axes)}
+
+
+def succeeded(record: MissionRecord) -> bool:
+    """Whether the mission did what it was for: nobody crashed, no phase ran out of time, and the answer is right.
+
+    Right is a source located and, where the mission identifies nuclides, the nuclide of the nearest true source named;
+    or, where there is no source, none located. A mission that looks for nothing has no answer to give.
+    """
+    if any(v.crashed for v in record.vehicles) or not all(phase.in_time for phase in record.phases):
+        return False
+    if record.sought == "nothing":
+        return True
+    active = tuple(s for s in record.sources if s.activity_mbq > 0.0)
+    if not active or record.estimate is None:
+        return not active and record.estimate is None
+    if record.sought == "source":
+        return True
+    nearest, _ = _nearest(np.asarray(record.estimate.position_m, float), active)
+    return nearest is not None and named(record.spectrum) == nearest.nuclide
+
+
+def all_keys(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Columns of all rows, in the order of the first row that has most of them."""
+    longest = max(rows, key=len)
+    return list(dict.fromkeys(key for row in (longest, *rows) for key in row))
+
+
+def batch_summary(rows: Sequence[dict[str, Any]], records: Sequence[MissionRecord], timings: Timings) -> dict[str, Any]:
+    """A batch in numbers: median, least and greatest of each numeric column of ``rows``, over the missions with one.
+
+    ``found`` says in how many missions the column has a value at all.
+    """
+    numbers = {}
+    for key in all_keys(rows):
+        found = (row.get(key) for row in rows)
+        values = [value for value in found if isinstance(value, int | float) and not isinstance(value, bool)]
+        if key != "seed" and values:
+            spread = (("median", np.median), ("min", np.min), ("max", np.max))
+            numbers[key] = {name: float(of(values)) for name, of in spread} | {"found": len(values)}
+    seeds = [row["seed"] for row in rows]
+    return {
+        "name": records[0].name,
+        "site": records[0].site,
+        "missions": len(rows),
+        "seed_first": min(seeds),
+        "seed_last": max(seeds),
+        "success_rate": float(np.mean([row["success"] for row in rows])),
+        "crashed_vehicles": int(sum(row["crashed"] for row in rows)),
+        "metrics": numbers,
+        "real_time_factor": real_time_factor(records, timings),
+        "timing": timing_summary(timings),
+        "versions": versions(),
+    }

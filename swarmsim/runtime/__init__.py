@@ -1,0 +1,1 @@
+"""What runs a simulation: compiled programs and how they are kept."""

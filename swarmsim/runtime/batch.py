@@ -1,0 +1,177 @@
+"""The mission axis: from a function of one mission to a compiled one of B missions, spread over the devices.
+
+Nothing outside this package knows that missions are batched. Arrays of the world and the plan that are small always
+carry the mission axis, so that sweeping them never compiles anew; large ones (rasters, detector tables) are shared by
+all missions unless they differ.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from swarmsim.runtime.clock import Clock
+from swarmsim.runtime.programs import Program
+
+SMALL = 4096  # elements up to which an array carries the mission axis whether or not missions differ in it
+TOGETHER = 256  # missions that an accelerator estimates in step; a processor core takes one, which fits its cache
+
+
+def shards_of(missions: int) -> int:
+    """On how many devices a batch is spread: all, as long as each gets at least two missions."""
+    return max(1, min(len(jax.devices()), missions // 2))
+
+
+def filled(seeds: np.ndarray) -> np.ndarray:
+    """Seeds padded with the last one, so that every device gets as many missions; the copies are discarded."""
+    return np.append(seeds, np.repeat(seeds[-1], -len(seeds) % shards_of(len(seeds))))
+
+
+class Batch:
+    """B missions side by side on the devices, and the programs that run them."""
+
+    def __init__(self, missions: int, clock: Clock):
+        """``missions`` is a multiple of `shards_of` it. Compile nothing yet."""
+        self.missions = missions
+        shards = shards_of(missions)
+        self.shards = shards if missions % shards == 0 else 1
+        self._clock = clock
+        self._mesh = Mesh(np.array(jax.devices()[: self.shards]), ("mission",)) if self.shards > 1 else None
+        self._programs: dict[Any, Program] = {}
+
+    def spread(self, trees: Sequence[Any]) -> "Spread":
+        """Arguments of B missions on the devices, from one tree for each mission, or one tree for all.
+
+        Trees of several missions must agree in structure and shapes.
+        """
+        leaves, structure = jax.tree.flatten(trees[0])
+        others = [jax.tree.flatten(tree)[0] for tree in trees[1:]]
+        own, shared, carries = [], [], []
+        for number, leaf in enumerate(leaves):
+            values = [np.asarray(leaf), *(np.asarray(other[number]) for other in others)]
+            differ = any(value is not values[0] and not np.array_equal(value, values[0]) for value in values)
+            carries.append(differ or values[0].size <= SMALL)
+            if carries[-1]:
+                rows = np.stack([values[i] for i in np.minimum(np.arange(self.missions), len(values) - 1)])
+                own.append(self.put(rows))
+            else:
+                shared.append(self.put(values[0], shared=True))
+        return Spread(structure, tuple(carries), own, shared)
+
+    def put(self, array: Any, *, shared: bool = False) -> Any:
+        """An array [B, …] spread over the devices, or a shared one copied to each."""
+        if self._mesh is None:
+            return jax.device_put(array)
+        return jax.device_put(array, NamedSharding(self._mesh, PartitionSpec() if shared else PartitionSpec("mission")))
+
+    def run(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        inputs: Sequence["Spread"],
+        carried: Any,
+        common: Sequence[Any] = (),
+        *,
+        only: Any = None,
+        in_turn: bool = False,
+    ) -> Any:
+        """``function(*inputs, carried, *common)`` of one mission, for all B at once.
+
+        Args:
+            name: of the program.
+            function: of one mission; everything static about it is fingerprinted, so name no values in its closure.
+            inputs: what differs by mission or not, as made by `spread`.
+            carried: pytree with the mission axis on every leaf.
+            common: arrays that all missions share.
+            only: [B] bool. With it the function maps ``carried`` to the like, and is evaluated for those missions
+                alone, in turn; the others keep theirs.
+            in_turn: one mission after the other, on an accelerator in groups of `TOGETHER`: for what fills a device.
+
+        Returns:
+            Its result with the mission axis on every leaf.
+        """
+        shape = (name, tuple((s.structure, s.carries) for s in inputs), only is not None, in_turn)
+        program = self._programs.get(shape)
+        if program is None:
+            apply = partial(_apply, function, tuple((s.structure, s.carries) for s in inputs))
+            batched = partial(_in_turn, _together()) if in_turn or only is not None else _every
+            whole = self._sharded(partial(batched, apply))
+            program = self._programs[shape] = Program(name, whole, clock=self._clock)
+        own = [s.own for s in inputs], carried, only
+        return program(own, ([s.shared for s in inputs], tuple(common)))
+
+    def _sharded(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """The function of equal parts of the missions, on the devices side by side; parts do not wait for another."""
+        if self._mesh is None:
+            return function
+        each, all_ = PartitionSpec("mission"), PartitionSpec()
+        return jax.shard_map(function, mesh=self._mesh, in_specs=(each, all_), out_specs=each, check_vma=False)
+
+
+class Spread:
+    """A pytree whose leaves either carry the mission axis (``own``) or are ``shared``."""
+
+    def __init__(self, structure: Any, carries: tuple[bool, ...], own: list[Any], shared: list[Any]):
+        self.structure, self.carries, self.own, self.shared = structure, carries, own, shared
+
+    def of(self, mission: int) -> Any:
+        """The pytree of one mission, on the host."""
+        own, shared = iter(self.own), iter(self.shared)
+        leaves = [np.asarray(next(own)[mission]) if carries else np.asarray(next(shared)) for carries in self.carries]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def _together() -> int:
+    return 1 if jax.default_backend() == "cpu" else TOGETHER
+
+
+def _apply(function: Callable[..., Any], shapes: Any, own: Any, common: Any) -> Any:
+    """The function of one mission on its unpacked arguments."""
+    (own_leaves, carried, _), (shared_leaves, arrays) = own, common
+    inputs = []
+    for (structure, carries), mine, shared in zip(shapes, own_leaves, shared_leaves, strict=True):
+        own_part, shared_part = iter(mine), iter(shared)
+        leaves = [next(own_part) if carry else next(shared_part) for carry in carries]
+        inputs.append(jax.tree.unflatten(structure, leaves))
+    return function(*inputs, carried, *arrays)
+
+
+def _every(apply: Callable[..., Any], own: Any, common: Any) -> Any:
+    """All missions in step."""
+    return jax.vmap(apply, in_axes=(0, None))(own, common)
+
+
+def _in_turn(together: int, apply: Callable[..., Any], own: Any, common: Any) -> Any:
+    """Groups of missions after one another; a group without a mission that is asked for keeps what it carries."""
+    _, carried, only = own
+    missions = jax.tree.leaves(carried)[0].shape[0]
+    size = together if missions % together == 0 else 1
+    grouped = jax.tree.map(lambda x: x.reshape(missions // size, size, *x.shape[1:]), own)
+
+    def evaluate(own: Any) -> Any:
+        return jax.vmap(apply, in_axes=(0, None))(own, common) if size > 1 else _alone(apply, own, common)
+
+    def those_asked(own: Any) -> Any:
+        _, carried, only = own
+
+        def new() -> Any:
+            return jax.tree.map(partial(_where, only), evaluate(own), carried)
+
+        return jax.lax.cond(jnp.any(only), new, lambda: carried)
+
+    made = jax.lax.map(evaluate if only is None else those_asked, grouped)
+    return jax.tree.map(lambda x: x.reshape(missions, *x.shape[2:]), made)
+
+
+def _alone(apply: Callable[..., Any], own: Any, common: Any) -> Any:
+    """The function of a group of one mission, without vmap: conditions stay conditions."""
+    result = apply(jax.tree.map(lambda x: x[0], own), common)
+    return jax.tree.map(lambda x: jnp.asarray(x)[None], result)
+
+
+def _where(mask: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
+    return jnp.where(mask.reshape(-1, *(1,) * (new.ndim - 1)), new, old)

@@ -1,0 +1,192 @@
+"""Functions compiled once: for the process, and for every later process of this user on this kind of machine.
+
+A program is found by a digest of what decides its machine code, computed without tracing (see `Program`). Its
+executable is looked up in this process, then in the user's cache folder (see `swarmsim.runtime.store`); only then is
+the function traced and compiled. JAX's own compilation cache is not needed and not touched.
+"""
+
+import gc
+import hashlib
+import itertools
+import os
+import time
+import warnings
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+
+from swarmsim.runtime.clock import Clock, Source
+from swarmsim.runtime.environment import environment, settings
+from swarmsim.runtime.executables import Executable, Executables, UnstorableError, cache_reads, load
+from swarmsim.runtime.fingerprint import UnidentifiableError, fingerprint, sharding_text
+
+# Settings that may change between two calls of a program; the others are set once, before JAX starts.
+_CHANGEABLE = ("jax_enable_x64", "jax_default_matmul_precision", "jax_debug_nans", "jax_default_device")
+
+_Ready = tuple[Callable[..., Any], Any]  # a compiled function of arrays to arrays, and the tree of its results
+_COMPILED: Source = "compiled"
+
+
+class Program:
+    """A pure function, compiled for each structure, shape and placement of its arguments that it meets.
+
+    What decides the machine code, and so makes the key: the program's name; the function with all that it closes over
+    (see `fingerprint`) and ``identity``; which arguments are donated; the arguments' tree, shapes, dtypes, weak types
+    and shardings; the sources of swarmsim; the versions of the packages it stands on; the devices; the settings of JAX
+    and XLA; the processor. Values that are arguments decide nothing: a program runs for other values as it is.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        *,
+        clock: Clock,
+        identity: Hashable = (),
+        donate: tuple[int, ...] = (),
+    ):
+        """Compile nothing yet.
+
+        ``identity`` is static configuration that the function reads from elsewhere than its closure and arguments (a
+        registry, a file), as plain values. ``donate`` numbers the arguments whose buffers the results may take over.
+        """
+        self.name = name
+        self._function = function
+        self._identity = identity
+        self._donate = donate
+        self._clock = clock
+        self._executables: dict[Any, _Ready] = {}
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The function's value, computed to the end; preparing (if needed) and running are timed on the clock."""
+        leaves, structure = jax.tree.flatten(arguments)
+        ready = self._executables.get(_situation(leaves, structure))
+        if ready is None:
+            ready, source, seconds = self._obtain(arguments)
+            self._clock.add(source, self.name, seconds)
+        call, tree = ready
+        start = time.perf_counter()
+        results = jax.block_until_ready(call(*leaves))
+        self._clock.add("ran", self.name, time.perf_counter() - start)
+        return jax.tree.unflatten(tree, results)
+
+    def _lacks(self, arguments: Sequence[Any]) -> bool:
+        return _situation(*jax.tree.flatten(tuple(arguments))) not in self._executables
+
+    def _obtain(self, arguments: Sequence[Any]) -> tuple[_Ready, Source, float]:
+        """The executable for these arguments, how it was obtained and the seconds it took."""
+        start = time.perf_counter()
+        leaves, structure = jax.tree.flatten(tuple(arguments))
+        with uncollected():
+            key = self._key(leaves, structure)
+            ready, source = (self._compile(arguments), _COMPILED) if key is None else self._shared(key, arguments)
+        self._executables[_situation(leaves, structure)] = ready
+        return ready, source, time.perf_counter() - start
+
+    def _shared(self, key: str, arguments: Sequence[Any]) -> tuple[_Ready, Source]:
+        """The executable of a key: of this process, or from the user's folder, or compiled and stored there."""
+        leaves, structure = jax.tree.flatten(tuple(arguments))
+        with _EXECUTABLES.lock_of(key):
+            executable = _EXECUTABLES.get(key) or load(key, len(leaves))
+            if executable is not None:
+                _EXECUTABLES.put(key, executable)
+                return (executable.call, executable.results_tree(structure)), "loaded"
+            before = cache_reads()
+            call, results = self._compile(arguments)
+            try:
+                executable = Executable.of(call, results, structure)
+                _EXECUTABLES.put(key, executable)
+                if cache_reads() == before:
+                    executable.save(key)
+            except UnstorableError as error:
+                _warn_not_kept(self.name, error)
+            return (call, results), _COMPILED
+
+    def _compile(self, arguments: Sequence[Any]) -> _Ready:
+        """The function of flat arguments and results, compiled, with the tree of its results."""
+        leaves, structure = jax.tree.flatten(tuple(arguments))
+        trees = []
+
+        def flat(*leaves: Any) -> list[Any]:
+            results, tree = jax.tree.flatten(self._function(*jax.tree.unflatten(structure, leaves)))
+            trees.append(tree)
+            return results
+
+        flat.__name__ = self.name.replace(" ", "_")  # what profilers show
+        ends = [0, *itertools.accumulate(len(jax.tree.leaves(argument)) for argument in arguments)]
+        donated = [leaf for number in self._donate for leaf in range(ends[number], ends[number + 1])]
+        return jax.jit(flat, donate_argnums=donated).lower(*leaves).compile(), trees[0]
+
+    def _key(self, leaves: Sequence[Any], structure: Any) -> str | None:
+        """The key of the executable; None, with a warning, where the function cannot be identified."""
+        try:
+            function, tree = self._function_fingerprint(), fingerprint(structure)
+        except UnidentifiableError as error:
+            _warn_not_kept(self.name, error)
+            return None
+        parts = (self.name, function, str(self._donate), tree, *map(_leaf_text, leaves), settings(), environment())
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+    def _function_fingerprint(self) -> str:
+        if not hasattr(self, "_fingerprint"):
+            self._fingerprint = fingerprint((self._function, self._identity))
+        return self._fingerprint
+
+
+def prepare(work: Sequence[tuple[Program, Sequence[Any]]]) -> None:
+    """Load or compile programs for their arguments, several at a time; arguments may be `jax.ShapeDtypeStruct` trees.
+
+    XLA compiles and loads outside Python's global lock, so the time falls with the cores. The clocks get the elapsed
+    time, divided among the programs in proportion to their own.
+    """
+    start = time.perf_counter()
+    missing = [(program, arguments) for program, arguments in work if program._lacks(arguments)]
+    if not missing:
+        return
+    with ThreadPoolExecutor(min(len(missing), os.cpu_count() or 1)) as threads:
+        taken = [threads.submit(program._obtain, arguments) for program, arguments in missing]
+    outcomes = [(source, seconds) for _, source, seconds in (future.result() for future in taken)]
+    share = (time.perf_counter() - start) / sum(seconds for _, seconds in outcomes)
+    for (program, _), (source, seconds) in zip(missing, outcomes, strict=True):
+        program._clock.add(source, program.name, seconds * share)
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Pause the cyclic garbage collector, which takes 25 % of the time of tracing."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+_EXECUTABLES = Executables(most=256)  # bounds the memory of a process that meets ever new scenarios
+
+
+def _warn_not_kept(name: str, reason: Exception) -> None:
+    warnings.warn(f"program {name!r} is compiled anew in every process: {reason}", stacklevel=2)
+
+
+def _situation(leaves: Sequence[Any], structure: Any) -> Hashable:
+    """What chooses among the executables of one program."""
+    return structure, tuple(map(_leaf, leaves)), tuple(getattr(jax.config, name) for name in _CHANGEABLE)
+
+
+def _leaf(leaf: Any) -> tuple[Any, ...]:
+    """Shape, dtype, weak type and placement of an argument; placement is None where JAX may choose it."""
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return leaf.shape, leaf.dtype, leaf.weak_type, leaf.sharding
+    kind = jax.typeof(leaf)
+    placement = leaf.sharding if getattr(leaf, "committed", False) else None
+    return kind.shape, kind.dtype, kind.weak_type, placement
+
+
+def _leaf_text(leaf: Any) -> str:
+    shape, dtype, weak_type, sharding = _leaf(leaf)
+    return f"{shape} {dtype} {weak_type} {sharding_text(sharding) if sharding is not None else 'anywhere'}"

@@ -1,0 +1,97 @@
+"""Progress of a rollout: the phase, the simulated time and the speed."""
+
+import time
+from types import TracebackType
+from typing import Protocol
+
+from rich.console import Console
+from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as RichBar
+
+
+class Progress(Protocol):
+    """What a rollout reports to, from the host and between compiled segments only."""
+
+    def phase(self, name: str, simulated_horizon_s: float) -> None:
+        """A phase begins that will simulate at most ``simulated_horizon_s``; zero when it simulates nothing."""
+
+    def advance(self, simulated_s: float, done: int, total: int) -> None:
+        """The phase has simulated ``simulated_s`` of every mission so far; ``done`` of ``total`` segments are over."""
+
+    def message(self, text: str) -> None:
+        """Print a line that stays on the screen."""
+
+
+class SilentProgress:
+    """Reports nothing."""
+
+    def phase(self, name: str, simulated_horizon_s: float) -> None:
+        """Do nothing."""
+
+    def advance(self, simulated_s: float, done: int, total: int) -> None:
+        """Do nothing."""
+
+    def message(self, text: str) -> None:
+        """Do nothing."""
+
+
+class RichProgress:
+    """A bar on the terminal for each phase; a context manager, so that the terminal is left as it was.
+
+    The speed is simulated time (of all ``missions`` together) over wall time since the first segment of the phase
+    ended: the first one may hold the compilation.
+    """
+
+    def __init__(self, console: Console | None = None, missions: int = 1):
+        """Draw on ``console`` (standard error when None)."""
+        self._missions = missions
+        self._bar = RichBar(
+            TextColumn("{task.description:<24}"),
+            BarColumn(),
+            TextColumn("{task.fields[simulated]:>18}"),
+            TextColumn("{task.fields[speed]:>14}"),
+            TimeElapsedColumn(),
+            console=console or Console(stderr=True),
+        )
+        self._task: TaskID | None = None
+        self._horizon_s = 0.0
+        self._first: tuple[float, float] | None = None  # wall time and simulated time after the first segment
+
+    def __enter__(self) -> "RichProgress":
+        """Start drawing."""
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Stop drawing; a phase that came to its end is shown as full."""
+        if kind is None:
+            self._close()
+        self._bar.stop()
+
+    def phase(self, name: str, simulated_horizon_s: float) -> None:
+        """End the bar before and begin that of the phase."""
+        self._close()
+        self._horizon_s, self._first = simulated_horizon_s, None
+        self._task = self._bar.add_task(name, total=None, simulated="", speed="")
+
+    def advance(self, simulated_s: float, done: int, total: int) -> None:
+        """Move the bar of the phase."""
+        if self._task is None:
+            raise RuntimeError("advance() before the first phase()")
+        now, speed = time.perf_counter(), ""
+        if self._first is None:
+            self._first = (now, simulated_s)
+        elif (wall := now - self._first[0]) > 0:
+            speed = f"{(simulated_s - self._first[1]) * self._missions / wall:,.0f} x real time"
+        simulated = f"{simulated_s:.0f} / {self._horizon_s:.0f} s" if self._horizon_s > 0 else ""
+        self._bar.update(self._task, completed=done, total=total, simulated=simulated, speed=speed)
+
+    def message(self, text: str) -> None:
+        """Print above the bars."""
+        self._bar.console.print(text, highlight=False, markup=False)
+
+    def _close(self) -> None:
+        if self._task is not None:
+            total = self._bar.tasks[self._bar.task_ids.index(self._task)].total or 1
+            self._bar.update(self._task, completed=total, total=total)
+            self._bar.stop_task(self._task)

@@ -1,0 +1,50 @@
+"""Fly a scenario and leave a run behind: what ``swarmsim run`` does, and what scripts call."""
+
+from pathlib import Path
+
+from swarmsim.config.errors import raise_if_any
+from swarmsim.config.scenario import Scenario
+from swarmsim.config.site_checks import check_site
+from swarmsim.results.extract import mission_record
+from swarmsim.results.out_folder import check_out
+from swarmsim.results.record import MissionRecord
+from swarmsim.results.run_directory import write_run
+from swarmsim.results.summary import Timings
+from swarmsim.runtime.progress import Progress, SilentProgress
+from swarmsim.runtime.simulation import MissionBatch, Simulation
+from swarmsim.site import load_site
+
+
+def build(scenario: Scenario) -> Simulation:
+    """Load the scenario's site, check the scenario against it, and build what flies it.
+
+    No setting of the process is changed (see `swarmsim.use_all_cores`). Raises `InputError` with everything that is
+    wrong.
+    """
+    site_model = load_site(scenario.site_file, tuple(scenario.materials))
+    raise_if_any(check_site(scenario, site_model))
+    return Simulation(scenario, site_model)
+
+
+def run(
+    scenario: Scenario, out: Path | str, missions: int = 1, progress: Progress | None = None, *, force: bool = False
+) -> tuple[MissionRecord, ...]:
+    """Fly ``missions`` missions (seeds N, N + 1, …) in one batch and write the run to ``out``, complete or not at all.
+
+    Raises `InputError` for a scenario that cannot be flown, and where ``out`` exists and ``force`` is not given.
+    """
+    tell = progress or SilentProgress()
+    check_out(Path(out), force)
+    tell.phase("load the site", 0.0)
+    simulation = build(scenario)
+    first = scenario.mission.seed
+    batch = simulation.rollout(range(first, first + missions), progress=tell)
+    records = tuple(mission_record(simulation, batch, index) for index in range(missions))
+    tell.phase("write", 0.0)
+    write_run(simulation, records, out, timings_of(batch), force=force)
+    return records
+
+
+def timings_of(batch: MissionBatch) -> Timings:
+    """Wall times of a rollout."""
+    return Timings(compile_s=batch.clock.compile_s, run_s=batch.clock.run_s)

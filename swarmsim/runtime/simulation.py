@@ -1,0 +1,255 @@
+"""A scenario built at its site: rolled out as whole missions, or stepped by hand."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from swarmsim.config.errors import InputError
+from swarmsim.config.scenario import Scenario
+from swarmsim.config.values import with_values
+from swarmsim.missions.begin import begin_mission, begin_phase
+from swarmsim.missions.knowledge import Conclusion, conclude, gathered, survey
+from swarmsim.missions.plan import Plan
+from swarmsim.missions.plan_build import build_plan, listens
+from swarmsim.missions.segment import segment
+from swarmsim.missions.state import Log, MissionState, Signals
+from swarmsim.runtime.batch import Batch, Spread, filled
+from swarmsim.runtime.clock import Clock
+from swarmsim.runtime.programs import prepare
+from swarmsim.runtime.progress import Progress, SilentProgress
+from swarmsim.site import SiteModel
+from swarmsim.world import randomness
+from swarmsim.world.build import build_world
+from swarmsim.world.model import World
+from swarmsim.world.state import Clock as WorldClock
+from swarmsim.world.state import WorldState
+from swarmsim.world.step import reset
+
+
+@dataclass(frozen=True)
+class Segment:
+    """What one segment left; arrays have the mission axis. ``log`` holds the groups that ran, None for the others."""
+
+    log: Log
+    running: np.ndarray  # [G] bool
+
+
+@dataclass(frozen=True)
+class MissionBatch:
+    """B missions as they were flown."""
+
+    seeds: np.ndarray  # [B]
+    worlds: Spread
+    plans: Spread
+    end: MissionState  # [B, …] at the end, its clock left out
+    segments: tuple[Segment, ...]
+    conclusion: Conclusion | None  # [B, …]; None where the mission estimates no source
+    clock: Clock
+
+    @property
+    def simulated_s(self) -> float:
+        """Simulated seconds of all missions."""
+        return float(np.sum(np.asarray(self.end.over_s)[: len(self.seeds)]))
+
+
+class Simulation:
+    """A scenario built at its site.
+
+    ``world`` and ``plan`` are one mission's, for use with the pure functions of `swarmsim.world.step`. Roll out as
+    often as you like, with whatever values: what has been compiled is kept, also for other simulations that differ
+    from this one in values only.
+    """
+
+    def __init__(self, scenario: Scenario, site_model: SiteModel):
+        """Build the arrays; nothing is compiled yet.
+
+        Raises `InputError` where periods, detectors and vehicles do not go together.
+        """
+        self.scenario, self.site_model = scenario, site_model
+        self.world, self.plan = _built(scenario, site_model)
+        self._batches: dict[int, Batch] = {}
+        self.clock = Clock()
+
+    def reset(self, seed: int) -> WorldState:
+        """One mission's world at its start, to be stepped by hand with `swarmsim.step`: every vehicle is active."""
+        return reset(self.world, jax.random.key(seed))
+
+    def rollout(
+        self,
+        seeds: int | Sequence[int] | np.ndarray,
+        values: Mapping[str, Sequence[Any]] | None = None,
+        progress: Progress | None = None,
+    ) -> MissionBatch:
+        """Run the missions of ``seeds`` to their end, in one batch.
+
+        Args:
+            seeds: a number, or a sequence of B.
+            values: for each path of the scenario (``"sources.0.activity_mbq"``) a value for each of the B missions.
+            progress: is told how far the missions are.
+
+        Raises:
+            InputError: a path or a value is wrong, or changes more than values (a count, a policy, a period).
+        """
+        tell = progress or SilentProgress()
+        numbers = np.atleast_1d(np.asarray(seeds, np.int64))
+        padded = filled(numbers)
+        batch = self._batches.setdefault(len(padded), Batch(len(padded), self.clock))
+        self.clock.reset()
+        worlds, plans = self._spread(batch, values or {}, len(numbers))
+        run = _Run(batch, worlds, plans, self.plan, tell)
+        keys = batch.put(randomness.mission_keys(padded))
+        end, segments = run.fly(keys)
+        return MissionBatch(
+            seeds=numbers,
+            worlds=worlds,
+            plans=plans,
+            end=end,
+            segments=tuple(segments),
+            conclusion=run.conclude(end, keys),
+            clock=self.clock.copy(),
+        )
+
+    def _spread(self, batch: Batch, values: Mapping[str, Sequence[Any]], missions: int) -> tuple[Spread, Spread]:
+        """World and plan of every mission."""
+        if not values:
+            return batch.spread([self.world]), batch.spread([self.plan])
+        for path, each in values.items():
+            if len(each) != missions:
+                raise InputError.of(
+                    "needs a value for each mission", path=path, given=f"{len(each)} values", allowed=str(missions)
+                )
+        built: dict[tuple[Any, ...], tuple[World, Plan]] = {}
+        pairs = []
+        for row in zip(*values.values(), strict=True):
+            key = tuple(map(repr, row))
+            if key not in built:
+                scenario = with_values(self.scenario, dict(zip(values, row, strict=True)))
+                built[key] = _built(scenario, self.site_model)
+                self._check_alike(built[key], values)
+            pairs.append(built[key])
+        return batch.spread([world for world, _ in pairs]), batch.spread([plan for _, plan in pairs])
+
+    def _check_alike(self, built: tuple[World, Plan], values: Mapping[str, Any]) -> None:
+        """Refuse what would need another program: other sizes, or other static choices."""
+        for own, other in zip((self.world, self.plan), built, strict=True):
+            same = jax.tree.structure(own) == jax.tree.structure(other)
+            if not same or jax.tree.map(np.shape, own) != jax.tree.map(np.shape, other):
+                raise InputError.of(
+                    "changes more than a value (a number of things, a policy, a period, a size): missions of one batch "
+                    "must agree in those",
+                    path=", ".join(values),
+                    suggestion="roll out a simulation of its own for each",
+                )
+
+
+def _built(scenario: Scenario, site_model: SiteModel) -> tuple[World, Plan]:
+    mates = scenario.mission.radio.mates if listens(scenario) else 0
+    world = build_world(scenario, site_model, mates)
+    return world, build_plan(scenario, site_model, world)
+
+
+class _Run:
+    """One rollout: the host's side of it."""
+
+    def __init__(self, batch: Batch, worlds: Spread, plans: Spread, plan: Plan, tell: Progress):
+        self._batch, self._plan, self._tell = batch, plan, tell
+        self._inputs = (worlds, plans)
+        self._estimates = plan.localisation is not None and plan.mapping is not None
+
+    def fly(self, keys: Any) -> tuple[MissionState, list[Segment]]:
+        """All missions to their end, a decision period at a time."""
+        batch, names = self._batch, [phase.name for phase in self._plan.phases]
+        mission, signals = batch.run("reset", _begin_mission, self._inputs, keys)
+        world = self._first_world()
+        timing, tick = world.timing, 0
+        segments: list[Segment] = []
+        horizon = float(sum(float(np.max(phase.time_limit_s)) for phase in self._plan.phases))
+        told: tuple[str, ...] = ()
+        begin, active = np.asarray(signals.begin), np.asarray(signals.active)
+        while True:
+            for number in np.flatnonzero(begin.any(axis=0)):
+                self._tell.phase(f"plan {names[number]}", 0.0)
+                mission = batch.run(
+                    f"begin {names[number]}", partial(_begin_phase, int(number)), self._inputs, mission,
+                    (np.int32(tick),), only=batch.put(begin[:, number]),
+                )  # fmt: skip
+                told = ()
+            running = self._running(mission) if begin.any() else active.any(axis=0)
+            mission, log, signals = batch.run(
+                "run", _segment, self._inputs, mission, (np.int32(tick), np.asarray(running))
+            )
+            tick += timing.decision_ticks
+            segments.append(Segment(log=_kept(log, running), running=running))
+            begin, active = np.asarray(signals.begin), np.asarray(signals.active)
+            under_way = tuple(n for n, r in zip(names, np.asarray(signals.running).any(axis=0), strict=True) if r)
+            if under_way and under_way != told:
+                self._tell.phase(" + ".join(under_way), horizon)
+                told = under_way
+            seconds = tick * timing.control_period_s
+            if told:
+                self._tell.advance(seconds, tick, max(tick, int(horizon / timing.control_period_s)))
+            if bool(np.asarray(signals.over).all()):
+                return mission, segments
+
+    def _first_world(self) -> World:
+        structure = self._inputs[0].structure
+        return jax.tree.unflatten(structure, [None] * structure.num_leaves)
+
+    def _running(self, mission: MissionState) -> np.ndarray:
+        """Groups [G] with an active vehicle in any mission."""
+        return np.array([bool(np.asarray(g.active).any()) for g in mission.world.groups])
+
+    def conclude(self, mission: MissionState, keys: Any) -> Conclusion | None:
+        """What the missions found in the end."""
+        if not self._estimates:
+            return None
+        self._tell.phase("estimate and identify", 0.0)
+        return self._batch.run("conclude", _conclude, self._inputs, (keys, mission), in_turn=True)
+
+
+def _with_clock(mission: MissionState, tick: jax.Array, running: jax.Array) -> MissionState:
+    return replace(mission, world=replace(mission.world, clock=WorldClock(tick=tick, running=running)))
+
+
+def _without_clock(mission: MissionState) -> MissionState:
+    """The mission without what all missions have in common, so that every leaf has the mission axis."""
+    return replace(mission, world=replace(mission.world, clock=None))  # type: ignore[arg-type]
+
+
+def _begin_mission(world: World, plan: Plan, key: jax.Array) -> tuple[MissionState, Signals]:
+    mission, signals = begin_mission(key, world, plan)
+    return _without_clock(mission), signals
+
+
+def _begin_phase(number: int, world: World, plan: Plan, mission: MissionState, tick: jax.Array) -> MissionState:
+    running = jnp.ones(len(world.groups), bool)
+    return _without_clock(begin_phase(world, plan, _with_clock(mission, tick, running), number))
+
+
+def _segment(
+    world: World, plan: Plan, mission: MissionState, tick: jax.Array, running: jax.Array
+) -> tuple[MissionState, Log, Signals]:
+    mission, log, signals = segment(world, plan, _with_clock(mission, tick, running))
+    return _without_clock(mission), log, signals
+
+
+def _conclude(world: World, plan: Plan, carried: tuple[jax.Array, MissionState]) -> Conclusion:
+    key, mission = carried
+    measurements = gathered(world, mission.windows)
+    known = survey(plan, measurements) if mission.survey is None else mission.survey
+    return conclude(key, world, plan, known, measurements)
+
+
+def _kept(log: Log, running: np.ndarray) -> Log:
+    """The log without the groups that rested throughout."""
+    tracks = tuple(t if r else None for t, r in zip(log.tracks, running, strict=True))
+    samples = tuple(s if r else None for s, r in zip(log.samples, running, strict=True))
+    return replace(log, tracks=tracks, samples=samples)  # type: ignore[arg-type]
+
+
+__all__ = ["MissionBatch", "Segment", "Simulation", "prepare"]

@@ -1,0 +1,164 @@
+"""A radiation counter on a vehicle: rates along its way, added up over its exposure, then drawn as counts."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.physics.rotations import rotate
+from swarmsim.pytree import pytree, static
+from swarmsim.radiation.detector import Detector, Source
+from swarmsim.radiation.rate import draw_counts, net_rate, observed_rate
+from swarmsim.site import Site, path_lengths
+from swarmsim.vehicles.state import RigidState
+
+
+@pytree
+class Counter:
+    """The detectors of a group: one model, mounted on each vehicle in its own way."""
+
+    detector: Detector  # without a vehicle axis: the group's vehicles carry the same model
+    mount_position_m: jax.Array  # [U, 3] centre of the crystal, body
+    mount_axis: jax.Array  # [U, 3] unit vector along the crystal, body
+    ticks: int = static()  # control periods between two evaluations of the rate
+    evaluations: int = static()  # evaluations in one exposure
+    index: int = static()  # of the detector's model in the mission
+
+
+@pytree
+class Reading:
+    """The latest completed exposure of each vehicle's counter."""
+
+    time_s: jax.Array  # [U] end of the exposure
+    position_m: jax.Array  # [U, 3] of the crystal, mean, world
+    travel_m: jax.Array  # [U, 3] way of the crystal during the exposure, world
+    axis: jax.Array  # [U, 3] unit vector along the crystal, mean, world
+    counts: jax.Array  # [U]
+    exposure_s: jax.Array  # [U] that the counts stand for
+    valid: jax.Array  # [U] bool: the vehicle had a part in the mission throughout
+    fresh: jax.Array  # [U] bool: completed in this control period
+
+    @property
+    def rate_cps(self) -> jax.Array:
+        """Counts over exposure [U]; zero before the first exposure."""
+        return self.counts / jnp.maximum(self.exposure_s, 1e-9)
+
+
+@pytree
+class CounterState:
+    """Sums of the exposure under way, and the last reading."""
+
+    rate_cps: jax.Array  # [U] sum over evaluations of the observed rate
+    position_m: jax.Array  # [U, 3] sum
+    velocity_m_s: jax.Array  # [U, 3] sum
+    axis: jax.Array  # [U, 3] sum
+    used: jax.Array  # [U] int32: evaluations of this exposure at which the vehicle had a part in the mission
+    expected_counts: jax.Array  # [U] mean of the last draw: differentiable, and unknown to the vehicle
+    reading: Reading
+
+
+def counter_start(vehicles: int) -> CounterState:
+    """State of counters that have measured nothing yet."""
+    zero, vectors, no = jnp.zeros(vehicles), jnp.zeros((vehicles, 3)), jnp.zeros(vehicles, bool)
+    reading = Reading(
+        time_s=zero, position_m=vectors, travel_m=vectors, axis=vectors, counts=zero, exposure_s=zero, valid=no, fresh=no
+    )
+    none = jnp.zeros(vehicles, jnp.int32)
+    return CounterState(
+        rate_cps=zero,
+        position_m=vectors,
+        velocity_m_s=vectors,
+        axis=vectors,
+        used=none,
+        expected_counts=zero,
+        reading=reading,
+    )
+
+
+def source_rate(site: Site, detector: Detector, sources: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
+    """Net count rate [] that all sources (leading axis S) cause in a crystal at a place [3] with an axis [3]."""
+
+    def one(source: Source) -> jax.Array:
+        lengths = path_lengths(site, source.position_m, position_m)
+        return net_rate(detector, source, lengths, position_m, axis)
+
+    return jnp.sum(jax.vmap(one)(sources))
+
+
+def count(
+    counter: Counter,
+    state: CounterState,
+    body: RigidState,
+    active: jax.Array,
+    member: jax.Array,
+    site: Site,
+    sources: Source,
+    key: jax.Array,
+    tick: jax.Array,
+    control_period_s: float,
+) -> CounterState:
+    """The counters (axis U) at the end of control period ``tick`` [] (counted from 1).
+
+    The rate is evaluated every ``counter.ticks`` control periods, where the vehicle then is; its mean over the
+    ``counter.evaluations`` of an exposure is the mean of the Poisson counts.
+
+    Args:
+        counter, state: of the group.
+        body: poses and velocities [U].
+        active: [U] bool, vehicles that have a part in the mission.
+        member: [U] int32, number of each vehicle in the mission.
+        site, sources: the true world.
+        key: of the mission's counts; a draw depends on it, the time and the vehicle's number only.
+        tick, control_period_s: the time.
+    """
+    state = replace(state, reading=replace(state.reading, fresh=jnp.zeros_like(state.reading.fresh)))
+
+    def evaluate(state: CounterState) -> CounterState:
+        return _evaluated(counter, state, body, active, site, sources)
+
+    def finish(state: CounterState) -> CounterState:
+        return _read_out(counter, state, member, key, tick, control_period_s)
+
+    state = jax.lax.cond(tick % counter.ticks == 0, evaluate, lambda s: s, state)
+    return jax.lax.cond(tick % (counter.ticks * counter.evaluations) == 0, finish, lambda s: s, state)
+
+
+def _evaluated(
+    counter: Counter, state: CounterState, body: RigidState, active: jax.Array, site: Site, sources: Source
+) -> CounterState:
+    """The sums with one more evaluation of the rate."""
+    centre = body.position_m + rotate(body.quaternion, counter.mount_position_m)
+    axis = rotate(body.quaternion, counter.mount_axis)
+    net = jax.vmap(lambda place, along: source_rate(site, counter.detector, sources, place, along))(centre, axis)
+    return replace(
+        state,
+        rate_cps=state.rate_cps + observed_rate(counter.detector, net),
+        position_m=state.position_m + centre,
+        velocity_m_s=state.velocity_m_s + body.velocity_m_s,
+        axis=state.axis + axis,
+        used=state.used + active,
+    )
+
+
+def _read_out(
+    counter: Counter, state: CounterState, member: jax.Array, key: jax.Array, tick: jax.Array, control_period_s: float
+) -> CounterState:
+    """Draw the counts of a completed exposure and begin the next one."""
+    n, vehicles = counter.evaluations, state.used.shape[0]
+    live_s = jnp.float32(counter.ticks * n * control_period_s)
+    keys = jax.vmap(lambda u: jax.random.fold_in(jax.random.fold_in(key, tick), u))(member)
+    draw = jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, live_s))
+    mean = state.rate_cps / n
+    counts, exposure = draw(keys, jax.lax.stop_gradient(mean))
+    norm = jnp.sqrt(jnp.sum(state.axis**2, axis=-1, keepdims=True) + 1e-12)
+    reading = Reading(
+        time_s=jnp.broadcast_to(tick * jnp.float32(control_period_s), (vehicles,)),
+        position_m=state.position_m / n,
+        travel_m=state.velocity_m_s / n * live_s,
+        axis=state.axis / norm,
+        counts=counts,
+        exposure_s=exposure,
+        valid=state.used == n,
+        fresh=jnp.ones(vehicles, bool),
+    )
+    return replace(counter_start(vehicles), expected_counts=mean * exposure, reading=reading)

@@ -1,0 +1,1 @@
+"""One mission: groups of vehicles, their state, the step, neighbours, radio and events."""

@@ -1,0 +1,212 @@
+"""A scenario as arrays: the true world that the step reads, built once on the host."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from swarmsim.config.checks import footprint_radius_m
+from swarmsim.config.errors import InputError
+from swarmsim.config.scenario import Scenario
+from swarmsim.config.vehicles import Multirotor, SkidSteer
+from swarmsim.physics.multirotor import check_time_step
+from swarmsim.radiation.detector import Detector, Source, build_detector
+from swarmsim.radiation.library import Library
+from swarmsim.sensors.radiation import Counter
+from swarmsim.site import SiteModel
+from swarmsim.site.model import height_at
+from swarmsim.vehicles.multirotor import multirotor_params
+from swarmsim.vehicles.skid_steer import skid_steer_params
+from swarmsim.world.model import Air, Group, Limits, Radio, Timing, TrafficRules, World
+
+EVALUATION_PERIOD_S = 0.12  # the rate of a detector is evaluated about this often during an exposure
+
+Spec = Multirotor | SkidSteer
+
+
+def build_timing(scenario: Scenario) -> Timing:
+    """Periods of a checked scenario as whole numbers."""
+    timing = scenario.mission.timing
+
+    def whole(period_s: float) -> int:
+        return max(1, round(period_s / timing.control_period_s))
+
+    judge = whole(timing.judge_period_s)
+    log = judge * max(1, round(whole(timing.log_period_s) / judge))
+    decision = log * max(1, round(whole(timing.decision_period_s) / log))
+    return Timing(
+        time_step_s=timing.time_step_s,
+        substeps=timing.physics_steps,
+        judge_ticks=judge,
+        log_ticks=log,
+        decision_ticks=decision,
+    )
+
+
+def library_of(scenario: Scenario) -> Library:
+    """Nuclides and materials of the scenario, in the order of every table and index."""
+    return Library(nuclides=tuple(scenario.nuclides.values()), materials=tuple(scenario.materials.values()))
+
+
+def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> World:
+    """The true world of a checked scenario at its site.
+
+    Args:
+        scenario, site_model: what to build.
+        mates: team mates that policies listen to; 0 leaves the radio off.
+
+    Raises:
+        InputError: a period does not suit a detector, or the time step a vehicle.
+    """
+    mission, site = scenario.mission, site_model.site
+    timing, library = build_timing(scenario), library_of(scenario)
+    radio = mission.radio
+    return World(
+        site=site,
+        sources=_sources(scenario, site_model, library),
+        air=Air(
+            speed_m_s=_f32(mission.wind.speed_m_s),
+            from_rad=_f32(math.radians(mission.wind.from_deg)),
+            gusts=_f32(mission.wind.gusts),
+        ),
+        traffic=TrafficRules(
+            separation_m=_f32(mission.traffic.separation_m),
+            ground_separation_m=_f32(mission.traffic.ground_separation_m),
+        ),
+        radio=Radio(
+            range_m=_f32(radio.range_m if radio.range_m is not None else np.inf),
+            loss=_f32(radio.loss),
+            delay=round(radio.delay_s / timing.judge_period_s),
+            mates=mates,
+        ),
+        groups=tuple(_group(scenario, members, timing, library) for members in grouped(scenario)),
+        timing=timing,
+        engine=mission.engine,
+    )
+
+
+def grouped(scenario: Scenario) -> tuple[tuple[int, ...], ...]:
+    """Members (their numbers) of one kind, number of rotors and feet, and detector model, in the order of the team."""
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for number, spec in enumerate(scenario.vehicles):
+        groups.setdefault(_suite(spec), []).append(number)
+    return tuple(tuple(members) for members in groups.values())
+
+
+def _suite(spec: Spec) -> tuple[Any, ...]:
+    detector = None if spec.detector is None else spec.detector.model
+    if isinstance(spec, Multirotor):
+        return spec.kind, len(spec.rotors), len(spec.feet.positions_m), detector
+    return spec.kind, detector
+
+
+def detector_models(scenario: Scenario) -> tuple[str, ...]:
+    """Models of the team's detectors, in the order of the team: what `Counter.index` and measurements index."""
+    return tuple(dict.fromkeys(s.detector.model for s in scenario.vehicles if s.detector is not None))
+
+
+def embodied(spec: Multirotor) -> Multirotor:
+    """The specification with the mass and inertia of its body file, where it names one."""
+    if spec.body is None:
+        return spec
+    from swarmsim.vehicles.bodies import with_file_body  # its readers take half a second to import
+
+    return with_file_body(spec)
+
+
+def _f32(value: ArrayLike) -> Any:
+    return np.asarray(value, np.float32)
+
+
+def _stack(items: Sequence[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *items)
+
+
+def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library: Library) -> Group:
+    specs = [scenario.vehicles[i] for i in members]
+    team = [scenario.members[i] for i in members]
+    params: dict[int, Any] = {}
+    for spec in specs:
+        if id(spec) not in params:  # many members share one specification
+            params[id(spec)] = _params(spec, timing)
+    return Group(
+        params=_stack([params[id(spec)] for spec in specs]),
+        limits=_limits(specs),
+        counter=_counter(scenario, specs, timing, library),
+        start_m=_f32([m.position_m for m in team]),
+        yaw_rad=_f32(np.radians([m.heading_deg for m in team])),
+        member=np.asarray(members, np.int32),
+        kind=specs[0].kind,
+    )
+
+
+def _params(spec: Spec, timing: Timing) -> Any:
+    if isinstance(spec, SkidSteer):
+        return skid_steer_params(spec)
+    check_time_step(spec, timing.time_step_s)
+    return multirotor_params(embodied(spec))
+
+
+def _limits(specs: Sequence[Spec]) -> Limits:
+    def half_height(spec: Spec) -> float:
+        return 0.5 * (spec.collision_height_m if isinstance(spec, Multirotor) else spec.chassis_size_m[2])
+
+    return Limits(
+        radius_m=_f32([footprint_radius_m(spec) for spec in specs]),
+        half_height_m=_f32([half_height(spec) for spec in specs]),
+        impact_speed_m_s=_f32([spec.impact_speed_max_m_s for spec in specs]),
+        battery_j=_f32([3600.0 * spec.battery.capacity_wh for spec in specs]),
+    )
+
+
+def _counter(scenario: Scenario, specs: Sequence[Spec], timing: Timing, library: Library) -> Counter | None:
+    mounts = [spec.detector for spec in specs if spec.detector is not None]
+    if not mounts:
+        return None
+    model = mounts[0].model
+    detector = _detector(scenario, model, library)
+    whole = _exposure_ticks(scenario, model, timing)
+    target = EVALUATION_PERIOD_S / timing.control_period_s
+    divisors = [n for n in range(1, whole + 1) if whole % n == 0]
+    ticks = min(divisors, key=lambda n: abs(math.log(n / target)))
+    axes = np.array([mount.axis for mount in mounts], np.float64)
+    return Counter(
+        detector=detector,
+        mount_position_m=_f32([mount.position_m for mount in mounts]),
+        mount_axis=_f32(axes / np.linalg.norm(axes, axis=1, keepdims=True)),
+        ticks=ticks,
+        evaluations=whole // ticks,
+        index=detector_models(scenario).index(model),
+    )
+
+
+def _detector(scenario: Scenario, model: str, library: Library) -> Detector:
+    mount = next(s.detector for s in scenario.vehicles if s.detector is not None and s.detector.model == model)
+    return build_detector(scenario.detectors[model], mount, library, scenario.mission.detection)
+
+
+def _exposure_ticks(scenario: Scenario, model: str, timing: Timing) -> int:
+    """Control periods in an exposure of a detector model."""
+    period = scenario.detectors[model].sample_period_s
+    whole = round(period / timing.control_period_s)
+    if whole < timing.judge_ticks:
+        raise InputError.of(
+            f"sample_period_s of {period:g} s of detector {model} is shorter than timing.judge_period_s",
+            given=f"{timing.judge_period_s:g} s",
+            suggestion=f"set timing.judge_period_s to {period:g} or less",
+        )
+    return whole
+
+
+def _sources(scenario: Scenario, site_model: SiteModel, library: Library) -> Source:
+    truths = scenario.mission.sources
+    xy = np.array([s.position_m for s in truths] or [(0.0, 0.0)], np.float64)
+    height = np.array([s.height_m for s in truths] or [0.0]) + height_at(site_model.site, xy)
+    return Source(
+        position_m=_f32(np.concatenate([xy, height[:, None]], axis=1)),
+        activity_bq=_f32([1e6 * s.activity_mbq for s in truths] or [0.0]),
+        nuclide=np.array([library.nuclide_index(s.nuclide) for s in truths] or [0], np.int32),
+    )

@@ -1,0 +1,33 @@
+"""What can end a vehicle's part in a mission: the kinds of events, and the time of the first of each kind."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+KINDS = ("crash", "obstacle", "vehicle", "battery_empty", "non_finite")
+"""crash: hit the ground too hard or tipped over · obstacle, vehicle: collided with one · battery_empty · non_finite: its
+state stopped being a number and is held at the last good one."""
+
+CRASH, OBSTACLE, VEHICLE, BATTERY_EMPTY, NON_FINITE = range(len(KINDS))
+DESCRIPTIONS = {
+    "crash": "hit the ground too fast, or tipped over",
+    "obstacle": "collided with an obstacle",
+    "vehicle": "collided with another vehicle",
+    "battery_empty": "used up its battery",
+    "non_finite": "had a non-finite state, and was stopped at its last finite one",
+}
+
+
+def none_yet() -> jax.Array:
+    """Event times [kinds] of a vehicle to which nothing has happened: infinity."""
+    return jnp.full(len(KINDS), jnp.inf, jnp.float32)
+
+
+def record(times_s: jax.Array, happened: jax.Array, now_s: jax.Array) -> jax.Array:
+    """Record first event times [kinds] of what ``happened`` [kinds]; a vehicle that has ended has no more events."""
+    return jnp.where(happened & able(times_s), jnp.minimum(times_s, now_s), times_s)
+
+
+def able(times_s: jax.Array | np.ndarray) -> jax.Array:
+    """Whether nothing has ended the vehicle's part [...], from event times [..., kinds]."""
+    return jnp.all(jnp.isinf(times_s), axis=-1)

@@ -1,0 +1,108 @@
+"""What judges vehicles, at a rate of its own: the ground below, the wind, the traffic, the radio, and events."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.physics.wind import gust_step, gust_velocity, steady_wind
+from swarmsim.world import events, randomness
+from swarmsim.world.kinds import KINDS
+from swarmsim.world.model import Group, Limits, World
+from swarmsim.world.multirotor import ground_below
+from swarmsim.world.neighbours import right_of_way
+from swarmsim.world.radio import broadcast
+from swarmsim.world.state import GroupState, Surroundings, WorldState
+
+
+def judge(world: World, state: WorldState) -> WorldState:
+    """The state with the surroundings of every vehicle refreshed and its events recorded."""
+    number = state.clock.tick // world.timing.judge_ticks
+    gusts = randomness.consumer(state.key, "gusts")
+    groups = tuple(
+        jax.lax.cond(running, partial(_refreshed, world, group, gusts, number), lambda g: g, g)
+        for running, group, g in zip(state.clock.running, world.groups, state.groups, strict=True)
+    )
+    groups, collided, crowded = _in_traffic(world, groups)
+    now = state.clock.tick * jnp.float32(world.timing.control_period_s)
+    groups = tuple(
+        _with_events(world, group, g, hit, now) for group, g, hit in zip(world.groups, groups, collided, strict=True)
+    )
+    state = replace(state, groups=groups, crowded=state.crowded | crowded)
+    return replace(state, radio=broadcast(world, state, number))
+
+
+def _refreshed(world: World, group: Group, gusts: jax.Array, number: jax.Array, state: GroupState) -> GroupState:
+    """The group with ground, height and wind where its vehicles are now."""
+    kind = KINDS[group.kind]
+    keys = randomness.per_vehicle(gusts, number, group.member)
+
+    def one(key: jax.Array, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
+        body = vehicle.body
+        ground = ground_below(world.site, body.position_m)
+        height = kind.height(params, vehicle, ground)
+        if not kind.FLIES:
+            return replace(around, ground=ground, height_m=height)
+        air = world.air
+        above = jnp.maximum(body.position_m[2] - ground.point_m[2], 0.0)
+        steady = steady_wind(air.speed_m_s, air.from_rad, above)
+        through = body.velocity_m_s - steady
+        airspeed = jnp.sqrt(jnp.sum(through * through) + 1e-12)
+        gust = gust_step(
+            key, around.gust, speed_m_s=air.speed_m_s, height_m=above, airspeed_m_s=airspeed,
+            dt=world.timing.judge_period_s,
+        )  # fmt: skip
+        wind = steady + air.gusts * gust_velocity(gust, air.speed_m_s, air.from_rad, above)
+        return replace(around, ground=ground, height_m=height, gust=gust, wind_m_s=wind)
+
+    return replace(state, around=jax.vmap(one)(keys, group.params, state.vehicle, state.around))
+
+
+def _in_traffic(
+    world: World, groups: tuple[GroupState, ...]
+) -> tuple[tuple[GroupState, ...], list[jax.Array], jax.Array]:
+    """Groups with what the other vehicles ask of each, which vehicles have collided [U], and the search's overflow."""
+    flies = [jnp.full(group.size, KINDS[group.kind].FLIES) for group in world.groups]
+    able = [g.active & events.able(g.event_time_s) for g in groups]
+    traffic = right_of_way(
+        jnp.concatenate([g.vehicle.body.position_m for g in groups]),
+        jnp.concatenate([g.vehicle.body.velocity_m_s for g in groups]),
+        height_m=jnp.concatenate([g.around.height_m for g in groups]),
+        flies=jnp.concatenate(flies),
+        active=jnp.concatenate(able),
+        rank=jnp.concatenate([group.member for group in world.groups]),
+        radius_m=jnp.concatenate([group.limits.radius_m for group in world.groups]),
+        half_height_m=jnp.concatenate([group.limits.half_height_m for group in world.groups]),
+        separation_m=world.traffic.separation_m,
+        ground_separation_m=world.traffic.ground_separation_m,
+    )
+    told, collided, first = [], [], 0
+    for group, g in zip(world.groups, groups, strict=True):
+        part = slice(first, first + group.size)
+        around = replace(
+            g.around, hold=traffic.hold[part], push_m=traffic.push_m[part], nearest_m=traffic.nearest_m[part]
+        )
+        told.append(replace(g, around=around))
+        collided.append(traffic.collided[part])
+        first += group.size
+    return tuple(told), collided, traffic.overflow
+
+
+def _with_events(world: World, group: Group, state: GroupState, collided: jax.Array, now_s: jax.Array) -> GroupState:
+    """The group with the events of the period that ends at ``now_s`` [] recorded."""
+    kind = KINDS[group.kind]
+
+    def one(params: Any, limits: Limits, state: GroupState, collided: jax.Array) -> jax.Array:
+        height, impact = state.around.height_m, state.impact_m_s
+        crash = kind.crashed(params, state.vehicle, height, impact, limits)
+        obstacle = kind.obstructed(params, state.vehicle, impact, limits, world.site)
+        empty = state.vehicle.energy_j > limits.battery_j
+        happened = jnp.stack([crash, obstacle, collided, empty, jnp.array(False)]) & state.finite
+        happened = happened.at[events.NON_FINITE].set(~state.finite) & state.active
+        return events.record(state.event_time_s, happened, now_s)
+
+    seen = replace(state, counter=None)
+    times = jax.vmap(one)(group.params, group.limits, seen, collided)
+    return replace(state, event_time_s=times, impact_m_s=jnp.zeros_like(state.impact_m_s))

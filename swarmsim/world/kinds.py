@@ -1,0 +1,47 @@
+"""The kinds of vehicle. A kind is one module with the functions of `Kind`; nothing else asks what a vehicle is."""
+
+from typing import Any, Protocol
+
+import jax
+
+from swarmsim.physics.contact import Plane
+from swarmsim.site import Site
+from swarmsim.world import multirotor, skid_steer
+from swarmsim.world.model import Limits
+
+
+class Kind(Protocol):
+    """Functions of one vehicle; parameters, states and commands are pytrees of the kind's own."""
+
+    FLIES: bool
+    """Whether it leaves the ground: it then has a wind, and keeps its distance in three dimensions."""
+
+    def rest(self, params: Any, site: Site, start_m: jax.Array, yaw_rad: jax.Array) -> Any:
+        """State at rest on the ground."""
+
+    def control_start(self) -> Any:
+        """Memory of the controller."""
+
+    def full_command(self, params: Any, command: Any) -> Any:
+        """What a policy returned, with every level (`swarmsim.control.commands`)."""
+
+    def stay(self, params: Any, vehicle: Any) -> Any:
+        """The command that keeps the vehicle where it is."""
+
+    def tick(
+        self, params: Any, vehicle: Any, control: Any, command: Any, armed: jax.Array, ground: Plane,
+        wind_m_s: jax.Array, site: Site, *, engine: str, dt: float, substeps: int,
+    ) -> tuple[Any, Any, jax.Array]:  # fmt: skip
+        """Vehicle, controller and impact speed [] after one control period."""
+
+    def height(self, params: Any, vehicle: Any, ground: Plane) -> jax.Array:
+        """Height [] of the lowest contact point above the ground."""
+
+    def crashed(self, params: Any, vehicle: Any, height_m: jax.Array, impact_m_s: jax.Array, limits: Limits) -> Any:
+        """Whether [] it tipped over or hit the ground too hard."""
+
+    def obstructed(self, params: Any, vehicle: Any, impact_m_s: jax.Array, limits: Limits, site: Site) -> jax.Array:
+        """Whether [] it hit an obstacle."""
+
+
+KINDS: dict[str, Any] = {"multirotor": multirotor, "skid_steer": skid_steer}

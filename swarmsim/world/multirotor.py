@@ -1,0 +1,112 @@
+"""The kind ``multirotor``: how one is controlled, flown and judged (see `swarmsim.world.kinds.Kind`)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.control.commands import MultirotorCommand, PositionCommand, multirotor_command
+from swarmsim.control.multirotor import ControlMemory, control
+from swarmsim.control.multirotor import control_start as controller
+from swarmsim.physics.contact import Plane
+from swarmsim.physics.multirotor import make_multirotor_step, rest_state
+from swarmsim.physics.rotations import yaw_of
+from swarmsim.site import Site, sample, sample_with_gradient
+from swarmsim.vehicles.multirotor import MultirotorParams
+from swarmsim.vehicles.state import MultirotorState
+from swarmsim.world.model import Limits
+
+FLIES = True
+TILT_LIMIT_COSINE = 0.3  # about 72 degrees: beyond it near the ground a multirotor has tipped over
+TIP_HEIGHT_M = 1.0
+OBSTACLE_HEIGHT_M = 0.4  # a surface this far above the terrain is an obstacle, not ground
+
+Command = MultirotorCommand | PositionCommand
+
+
+def ground_below(site: Site, position_m: jax.Array) -> Plane:
+    """Tangent plane of the terrain below a position [3]."""
+    height, slope = sample_with_gradient(site.terrain_m, site, position_m[:2])
+    normal = jnp.append(-slope, 1.0)
+    return Plane(point_m=jnp.append(position_m[:2], height), normal=normal * jax.lax.rsqrt(jnp.sum(normal * normal)))
+
+
+def rest(params: MultirotorParams, site: Site, start_m: jax.Array, yaw_rad: jax.Array) -> MultirotorState:
+    """At rest on its feet, motors off."""
+    return rest_state(params, ground_below(site, jnp.append(start_m, 0.0)), yaw_rad)
+
+
+def control_start() -> ControlMemory:
+    """Controller of a vehicle on the ground: motors off until a climb is commanded."""
+    return controller(landed=True)
+
+
+def full_command(params: MultirotorParams, command: Any) -> Command:
+    """What a policy returned; a position command needs no other levels beside it."""
+    if isinstance(command, PositionCommand):
+        return command
+    return multirotor_command(command, params.rotor_spin.shape[-1])
+
+
+def stay(params: MultirotorParams, vehicle: MultirotorState) -> PositionCommand:
+    """Brake and hold the velocity at zero, heading as it is."""
+    zero = jnp.zeros(3)
+    yaw = yaw_of(vehicle.body.quaternion)
+    return PositionCommand(
+        position_m=zero, velocity_m_s=zero, acceleration_m_s2=zero, yaw_rad=yaw, hold_position=jnp.zeros(())
+    )
+
+
+def tick(
+    params: MultirotorParams,
+    vehicle: MultirotorState,
+    memory: ControlMemory,
+    command: Command,
+    armed: jax.Array,
+    ground: Plane,
+    wind_m_s: jax.Array,
+    site: Site,
+    *,
+    engine: Any,
+    dt: float,
+    substeps: int,
+) -> tuple[MultirotorState, ControlMemory, jax.Array]:
+    """Vehicle, controller and impact speed [] after one control period; rotors that are not ``armed`` run down."""
+    step = make_multirotor_step(engine, dt)
+    speeds, memory = control(params, memory, vehicle, command, substeps * dt)
+    speeds = jnp.where(armed, speeds, 0.0)
+    velocity = vehicle.body.velocity_m_s
+
+    def one(vehicle: MultirotorState, _: None) -> tuple[MultirotorState, None]:
+        return step(params, vehicle, speeds, wind_m_s, ground), None
+
+    vehicle, _ = jax.lax.scan(one, vehicle, None, length=substeps)
+    before = jnp.sqrt(jnp.sum(velocity * velocity) + 1e-12)
+    return vehicle, memory, jnp.where(vehicle.ground_force_n > 0.0, before, 0.0)
+
+
+def height(params: MultirotorParams, vehicle: MultirotorState, ground: Plane) -> jax.Array:
+    """Height [] of the feet of the level vehicle above the ground."""
+    rest_height = -jnp.min(params.contact_position_m[:, 2])
+    return jnp.sum((vehicle.body.position_m - ground.point_m) * ground.normal) - rest_height
+
+
+def crashed(
+    params: MultirotorParams, vehicle: MultirotorState, height_m: jax.Array, impact_m_s: jax.Array, limits: Limits
+) -> jax.Array:
+    """Whether [] it met the ground too fast, or lies on its side."""
+    q = vehicle.body.quaternion
+    upright = 1.0 - 2.0 * (q[1] ** 2 + q[2] ** 2)
+    return (impact_m_s > limits.impact_speed_m_s) | ((height_m < TIP_HEIGHT_M) & (upright < TILT_LIMIT_COSINE))
+
+
+def obstructed(
+    params: MultirotorParams, vehicle: MultirotorState, impact_m_s: jax.Array, limits: Limits, site: Site
+) -> jax.Array:
+    """Whether [] the cylinder around it reaches into something that stands on the terrain."""
+    position = vehicle.body.position_m
+    ring = limits.radius_m * jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    around = position[:2] + ring
+    surface = sample(site.surface_m, site, around)
+    stands = surface - sample(site.terrain_m, site, around) > OBSTACLE_HEIGHT_M
+    return jnp.any(stands & (position[2] - limits.half_height_m < surface))

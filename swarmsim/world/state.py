@@ -1,0 +1,71 @@
+"""The state of one mission's world, and what its sensors read. Leading axis U: the vehicles of a group."""
+
+from typing import Any
+
+import jax
+
+from swarmsim.physics.contact import Plane
+from swarmsim.physics.wind import GustState
+from swarmsim.pytree import pytree
+from swarmsim.sensors.radiation import CounterState, Reading
+
+
+@pytree
+class Clock:
+    """What all missions of a batch have in common: they advance together. It carries no mission axis."""
+
+    tick: jax.Array  # [] int32: control periods since the start
+    running: jax.Array  # [G] bool: groups that are stepped; one that waits or has ended is not
+
+
+@pytree
+class Surroundings:
+    """What is around a vehicle, refreshed once in a judging period."""
+
+    ground: Plane  # tangent plane of the terrain below it
+    wind_m_s: jax.Array  # [U, 3] velocity of the air, world
+    gust: GustState
+    height_m: jax.Array  # [U] of the lowest contact point above the ground
+    hold: jax.Array  # [U] bool: another vehicle has the right of way
+    push_m: jax.Array  # [U, 3] displacement that keeps apart from it, world
+    nearest_m: jax.Array  # [U] distance of the nearest other vehicle
+
+
+@pytree
+class GroupState:
+    """All vehicles of one group."""
+
+    vehicle: Any  # state of the group's kind
+    control: Any  # memory of its controller
+    around: Surroundings
+    active: jax.Array  # [U] bool: has a part in the mission now; the others rest where they are, with motors off
+    impact_m_s: jax.Array  # [U] largest speed at which it met the ground or a wall since it was last judged
+    finite: jax.Array  # [U] bool: its state is still made of numbers
+    event_time_s: jax.Array  # [U, kinds] first time of each kind of event, inf where there was none
+    counter: CounterState | None  # of its radiation detector
+
+
+@pytree
+class RadioState:
+    """Broadcasts that are still under way. V: all vehicles of the mission, D: judging periods of delay, plus one."""
+
+    position_m: jax.Array  # [D, V, 3] world; slot 0 was sent last
+    velocity_m_s: jax.Array  # [D, V, 3] world
+    count_rate_cps: jax.Array  # [D, V]
+    heard_index: jax.Array  # [V, K] int32: team mates of whom a message came
+    heard: jax.Array  # [V, K] bool
+
+
+@pytree
+class WorldState:
+    """One mission's world."""
+
+    clock: Clock
+    key: jax.Array  # [] randomness of the mission
+    groups: tuple[GroupState, ...]
+    radio: RadioState
+    crowded: jax.Array  # [] bool: more vehicles in one place than the neighbour search can hold, at any time
+
+
+Readings = tuple[Reading | None, ...]
+"""For each group what its detectors read; None for a group without."""

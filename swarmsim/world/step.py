@@ -1,0 +1,178 @@
+"""One step of one world: every vehicle of one mission, one control period.
+
+Pure and without a host call, so that `jax.jit`, `jax.vmap`, `jax.lax.scan` and `jax.grad` work on it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.physics.wind import gust_start
+from swarmsim.pytree import pytree
+from swarmsim.runtime.scalars import over_vehicles
+from swarmsim.sensors.radiation import count, counter_start
+from swarmsim.world import events, randomness
+from swarmsim.world.judge import judge
+from swarmsim.world.kinds import KINDS
+from swarmsim.world.model import Group, World
+from swarmsim.world.multirotor import ground_below
+from swarmsim.world.radio import radio_start
+from swarmsim.world.state import Clock, GroupState, Readings, Surroundings, WorldState
+
+
+def reset(world: World, key: jax.Array, *, active: bool = True) -> WorldState:
+    """Every vehicle at rest at its start.
+
+    Args:
+        world: of one mission.
+        key: randomness of the mission (`jax.random.key` of its seed).
+        active: whether the vehicles have a part in the mission from the beginning; those that have none rest.
+    """
+    groups = tuple(_group_start(world, group, key, active) for group in world.groups)
+    clock = Clock(tick=jnp.int32(0), running=jnp.ones(len(groups), bool))
+    return WorldState(
+        clock=clock, key=key, groups=groups, radio=radio_start(world, groups), crowded=jnp.array(False)
+    )
+
+
+def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> GroupState:
+    kind = KINDS[group.kind]
+    vehicle = jax.vmap(kind.rest, in_axes=(0, None, 0, 0))(group.params, world.site, group.start_m, group.yaw_rad)
+    position = vehicle.body.position_m
+    size = group.size
+    gust_keys = randomness.per_vehicle(randomness.consumer(key, "gust start"), jnp.int32(0), group.member)
+    around = Surroundings(
+        ground=jax.vmap(ground_below, in_axes=(None, 0))(world.site, position),
+        wind_m_s=jnp.zeros((size, 3)),
+        gust=jax.vmap(gust_start)(gust_keys),
+        height_m=jnp.zeros(size),
+        hold=jnp.zeros(size, bool),
+        push_m=jnp.zeros((size, 3)),
+        nearest_m=jnp.full(size, jnp.inf),
+    )
+    memory = kind.control_start()
+    return GroupState(
+        vehicle=vehicle,
+        control=jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), memory),
+        around=around,
+        active=jnp.full(size, active),
+        impact_m_s=jnp.zeros(size),
+        finite=jnp.ones(size, bool),
+        event_time_s=jnp.broadcast_to(events.none_yet(), (size, len(events.KINDS))),
+        counter=None if group.counter is None else counter_start(size),
+    )
+
+
+def step(world: World, state: WorldState, commands: Sequence[Any]) -> tuple[WorldState, Readings]:
+    """The world one control period later, and what its detectors read.
+
+    Args:
+        world: of one mission.
+        state: at the start of the period.
+        commands: one for each group, with leading axis U: a class of `swarmsim.control.commands` that suits its kind.
+            Vehicles that are not active disregard it.
+
+    Returns:
+        State and readings; ``fresh`` tells which exposures ended in this period.
+
+    Raises:
+        TypeError, ValueError: while tracing, where a command does not suit its group.
+    """
+    due = state.clock.tick % world.timing.judge_ticks == 0
+    state = jax.lax.cond(due, partial(judge, world), lambda s: s, state)
+    state = advance(world, state, commands)
+    return state, readings_of(state)
+
+
+def readings_of(state: WorldState) -> Readings:
+    """Latest reading of every group's detectors."""
+    return tuple(None if g.counter is None else g.counter.reading for g in state.groups)
+
+
+def hold(world: World, state: WorldState) -> tuple[Any, ...]:
+    """Commands that keep every vehicle where it is: multirotors brake and hover, rovers stand."""
+    return tuple(
+        jax.vmap(KINDS[group.kind].stay)(group.params, g.vehicle)
+        for group, g in zip(world.groups, state.groups, strict=True)
+    )
+
+
+def full_commands(world: World, commands: Sequence[Any]) -> tuple[Any, ...]:
+    """Commands of all groups in the form that the step works on, their shapes checked."""
+    if len(commands) != len(world.groups):
+        raise ValueError(f"there are {len(commands)} commands for {len(world.groups)} groups of vehicles")
+    full = []
+    for number, (group, command) in enumerate(zip(world.groups, commands, strict=True)):
+        for name, leaf in vars(command).items():
+            if jnp.ndim(leaf) and jnp.shape(leaf)[0] != group.size:
+                raise ValueError(
+                    f"{type(command).__name__}.{name} for group {number} has the shape {jnp.shape(leaf)}: the group "
+                    f"has {group.size} vehicles, so its first axis must be {group.size}"
+                )
+        every = jax.tree.map(lambda x, n=group.size: x if jnp.ndim(x) else jnp.full(n, x, jnp.float32), command)
+        full.append(jax.vmap(partial(KINDS[group.kind].full_command, _one(group.params)))(every))
+    return tuple(full)
+
+
+def _one(params: Any) -> Any:
+    return jax.tree.map(lambda x: x[0], params)
+
+
+def advance(world: World, state: WorldState, commands: Sequence[Any]) -> WorldState:
+    """The world one control period later, without looking at ground, traffic, wind and events."""
+    tick = state.clock.tick + 1
+    groups = []
+    for number, (group, command) in enumerate(zip(world.groups, full_commands(world, commands), strict=True)):
+        go = partial(_advance_group, world, group, state.key, tick, command)
+        groups.append(jax.lax.cond(state.clock.running[number], go, lambda g: g, state.groups[number]))
+    return replace(state, clock=replace(state.clock, tick=tick), groups=tuple(groups))
+
+
+@pytree
+class _Moved:
+    """One vehicle after a control period."""
+
+    vehicle: Any
+    control: Any
+    impact_m_s: jax.Array  # []
+    finite: jax.Array  # []
+
+
+def _advance_group(
+    world: World, group: Group, key: jax.Array, tick: jax.Array, command: Any, before: GroupState
+) -> GroupState:
+    kind, timing = KINDS[group.kind], world.timing
+
+    def one(params: Any, state: GroupState, command: Any, site: Any) -> _Moved:
+        armed = state.active & events.able(state.event_time_s)
+        vehicle, control, impact = kind.tick(
+            params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wind_m_s, site,
+            engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps,
+        )  # fmt: skip
+        total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))
+        finite = jnp.isfinite(total)  # a sum is finite only if all of its parts are
+        moves = state.active & finite & state.finite
+        kept = jax.tree.map(
+            lambda new, old: jnp.where(moves, new, old), (vehicle, control), (state.vehicle, state.control)
+        )
+        impact = jnp.maximum(state.impact_m_s, jnp.where(moves, impact, 0.0))
+        return _Moved(vehicle=kept[0], control=kept[1], impact_m_s=impact, finite=state.finite & finite)
+
+    seen = replace(before, counter=None)  # the counter is of no concern to the motion
+    moved = over_vehicles(one, in_axes=(0, 0, 0, None), unroll=1)(group.params, seen, command, world.site)
+    after = replace(
+        before, vehicle=moved.vehicle, control=moved.control, impact_m_s=moved.impact_m_s, finite=moved.finite
+    )
+    if group.counter is None or before.counter is None:
+        return after
+    measuring = after.active & events.able(after.event_time_s)
+    counts = randomness.consumer(key, "counts")
+    counter = count(
+        group.counter, before.counter, after.vehicle.body, measuring, group.member, world.site, world.sources, counts,
+        tick, timing.control_period_s,
+    )  # fmt: skip
+    return replace(after, counter=counter)

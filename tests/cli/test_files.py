@@ -1,0 +1,148 @@
+"""Commands that work on files: check, schema, list, init and import-site."""
+
+import json
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from swarmsim import cli
+from swarmsim.config.files import KINDS, packaged_dir
+from tests.config.project import make_project, spoil
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project folder, which is the working folder."""
+    make_project(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def everything(folder: Path) -> set[Path]:
+    return set(folder.rglob("*"))
+
+
+def test_check_tells_all_problems_of_all_files(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    configs = project / "configs"
+    spoil(configs / "vehicles/x500.yaml", "mass_kg", "mas_kg")
+    spoil(configs / "nuclides/Co-57.yaml", "half_life_s", "half_life")
+    files = ["vehicles/x500.yaml", "nuclides/Co-57.yaml", "nuclides/Co-60.yaml", "materials/air.yaml", "missing.yaml"]
+    assert cli.main(["check", *(f"configs/{file}" for file in files)]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == "ok  configs/nuclides/Co-60.yaml (nuclide)\nok  configs/materials/air.yaml (material)\n"
+    for fragment in ("did you mean 'mass_kg'", "did you mean 'half_life_s'", "no file 'configs/missing.yaml'"):
+        assert fragment in printed.err
+
+
+def test_check_cannot_tell_the_kind_of_anything(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (project / "x.yaml").write_text("colour: red\n")
+    (project / "empty").mkdir()
+    assert cli.main(["check", "x.yaml", "empty"]) == 2
+    printed = capsys.readouterr().err
+    assert "cannot tell what this file describes" in printed
+    assert "holds no YAML file" in printed
+
+
+def test_init_copies_everything_and_check_finds_it_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["init", "mine"]) == 0
+    assert "cd mine && swarmsim run recon" in capsys.readouterr().out
+    suffixes = (".yaml", ".yml", ".dae", ".urdf", ".xacro", ".stl", ".obj")  # not the scripts that generate data
+    shipped = {path.relative_to(packaged_dir()) for path in packaged_dir().rglob("*") if path.suffix in suffixes}
+    copied = tmp_path / "mine" / "configs"
+    assert {path.relative_to(copied) for path in copied.rglob("*") if path.is_file()} == shipped
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["configs"]
+    monkeypatch.chdir(tmp_path / "mine")
+    kinds = [kind for kind in KINDS if kind in {path.parts[0] for path in shipped}]
+    assert cli.main(["check", *(f"configs/{kind}" for kind in kinds)]) == 0
+    count = sum(path.suffix == ".yaml" and path.parts[0] in KINDS for path in shipped)
+    assert capsys.readouterr().out.count("ok  configs/") == count
+
+
+def test_init_never_overwrites(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.read_bytes() for path in everything(project) if path.is_file()}
+    assert cli.main(["init", "."]) == 2
+    assert "not overwritten" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in everything(project) if path.is_file()} == before
+    (project / "file").write_text("")
+    assert cli.main(["init", "file"]) == 2
+
+
+def test_an_init_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(source: Path, target: Path, **_: Any) -> None:
+        (target / "vehicles").mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("swarmsim.cli.files.shutil.copytree", interrupted)
+    assert cli.main(["init", "mine"]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_list(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spoil(project / "configs/nuclides/Co-57.yaml", "half_life_s", "half_life")
+    assert cli.main(["list"]) == 0
+    printed = capsys.readouterr().out
+    for word in (
+        "tarot_t650",
+        "works_yard",
+        "recon_paper",
+        "nai_2x2",
+        "Cs-137",
+        "661.66 keV",
+        "concrete",
+        "2300 kg/m3",
+    ):
+        assert word in printed
+    assert "parallel_lines" in printed
+    assert "not valid: 2 problems, see swarmsim check" in printed
+    assert cli.main(["list", "vehicles"]) == 0
+    assert "Cs-137" not in capsys.readouterr().out
+
+
+def test_schema_is_json_of_the_model(capsys: pytest.CaptureFixture[str]) -> None:
+    for kind, field in (("mission", "phases"), ("nuclide", "half_life_s"), ("site", "cell_m")):
+        assert cli.main(["schema", kind]) == 0
+        schema = json.loads(capsys.readouterr().out)
+        assert field in schema["properties"]
+        assert schema["additionalProperties"] is False
+    assert cli.main(["schema", "vehicle"]) == 0
+    assert set(json.loads(capsys.readouterr().out)["discriminator"]["mapping"]) == {"multirotor", "skid_steer"}
+
+
+def test_import_site(project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    given: list[Any] = []
+
+    def imported(file: Path, out: Path, options: Any) -> types.SimpleNamespace:
+        given.append((file, out, options))
+        out.mkdir(parents=True)
+        parts = [
+            {"names": [name], "is": what} for name, what in (("lawn", "ground"), ("shed", "wood"), ("hut", "wood"))
+        ]
+        return types.SimpleNamespace(
+            name=options.name or out.name, report={"area_m2": 123.0, "warnings": [], "parts": parts}
+        )
+
+    monkeypatch.setattr("swarmsim.site.import_site", imported)
+    command = ["import-site", "yard.obj", "--out", "configs/sites/yard", "--unit", "0.01", "--up", "Y", "--cell", "1"]
+    assert cli.main([*command, "--ground", "soil*", "--ground", "grass*", "--licence", "CC0-1.0"]) == 0
+    file, out, options = given[0]
+    assert (file, out, options.cell_m, options.overwrite) == (Path("yard.obj"), Path("configs/sites/yard"), 1.0, False)
+    assert options.licence == "CC0-1.0"
+    assert options.fields == {"unit_m": 0.01, "up_axis": "Y", "ground": ["soil*", "grass*"]}
+    printed = capsys.readouterr().out
+    for fragment in ("area_m2", "ground: lawn", "wood: shed, hut", "none"):
+        assert fragment in printed
+    assert cli.main(command) == 2
+    assert "--force" in capsys.readouterr().err
+
+
+def test_import_site_of_a_missing_file(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = everything(project)
+    assert cli.main(["import-site", "no.dae", "--out", "configs/sites/new"]) == 2
+    assert "no.dae" in capsys.readouterr().err
+    assert everything(project) == before

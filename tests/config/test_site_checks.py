@@ -1,0 +1,115 @@
+"""Scenarios against the ground of a site with one hollow building, one solid wall and one hedge."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.config.scenario import load_scenario
+from swarmsim.config.site import SiteSpec
+from swarmsim.config.site_checks import check_site
+from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
+from tests.config.project import line_of, spoil
+
+SURVEY, FIRST = "phases.survey.settings", "phases.0.settings"
+ROUND = (
+    "{name: b, who: orpheus, policy: waypoints, settings: {speed_m_s: 1, points: [[0, 30], [0, -71]]}, time_limit_s: 9}"
+)
+
+# 160 m x 140 m around the origin, 2 m high ground. Boxes: a building of 20 x 10 x 6 m with walls of 0.3 m, turned by
+# 90 degrees; a solid wall of 20 x 1 x 4 m; a hedge of 4 x 4 x 2 m; a place holder of no size.
+CENTRES = [[0.0, 0.0, 5.0], [40.0, 20.0, 4.0], [-30.0, 30.0, 3.0], [0.0, 0.0, 2.0]]
+HALVES = [[10.0, 5.0, 3.0], [10.0, 0.5, 2.0], [2.0, 2.0, 1.0], [0.0, 0.0, 0.0]]
+MATERIALS = ["brick", "concrete", "vegetation", "concrete"]
+
+
+@pytest.fixture
+def site() -> SiteModel:
+    names = ("air", "brick", "concrete", "soil", "vegetation")
+    raster = np.full((140, 160), 2.0, np.float32)
+    clearance = np.full((140, 160), 3.0, np.float32)
+    clearance[:, :10] = -1.0
+    ground = Site(
+        origin_m=jnp.array([-79.5, -69.5]),
+        cell_m=jnp.array(1.0),
+        terrain_m=jnp.array(raster),
+        surface_m=jnp.array(raster),
+        clearance_m=jnp.array(clearance),
+        cost=jnp.array(raster),
+        obstacles=Obstacles(
+            centre_m=jnp.array(CENTRES),
+            half_extent_m=jnp.array(HALVES),
+            axis=jnp.array([[0.0, 1.0], [1.0, 0.0], [1.0, 0.0], [1.0, 0.0]]),
+            wall_m=jnp.array([0.3, 0.0, 0.0, 0.0]),
+            material=jnp.array([names.index(name) for name in MATERIALS], jnp.int32),
+        ),
+        survey_area_m=jnp.array([[-70.0, -60.0], [70.0, -60.0], [70.0, 60.0], [-70.0, 60.0]]),
+        ground_material=jnp.array(3, jnp.int32),
+        material_names=names,
+    )
+    mesh = VisualMesh(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint32), np.zeros((0, 4), np.uint8))
+    spec = SiteSpec(name="made_up", file="made_up.dae", licence="CC0-1.0", cell_m=1.0)
+    return SiteModel(name="made_up", spec=spec, site=ground, mesh=mesh, report={})
+
+
+def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
+    assert check_site(load_scenario(mission), site) == []
+
+
+@pytest.mark.parametrize(
+    ("override", "path", "fragments"),
+    [
+        ("sources.0.position_m=[90, 0]", "sources.0.position_m", ["outside the site", "x from -80 to 80"]),
+        ("sources.0.position_m=[4.85, 3]", "sources.0.position_m", ["inside the wall of a building of brick"]),
+        ("sources.0.position_m=[3, 9.85]", "sources.0.position_m", ["inside the wall of a building of brick"]),
+        ("sources.0.position_m=[45, 20.2]", "sources.0.position_m", ["inside a solid obstacle of concrete"]),
+        ("vehicles.uav1.position_m=[-85, 0]", "vehicles.0.position_m", ["'uav1' starts outside the site", "x from"]),
+        ("vehicles.uav1.position_m=[0, 8]", "vehicles.0.position_m", ["'uav1' starts inside an obstacle of brick"]),
+        ("vehicles.uav1.position_m=[5.2, 0]", "vehicles.0.position_m", ["or touches it", "from every obstacle"]),
+        ("vehicles.orpheus.position_m=[-75, 0]", "vehicles.3.position_m", ["'orpheus' starts where a rover cannot"]),
+        (f"{SURVEY}.area_m=[[0, 0], [200, 0], [0, 60]]", f"{FIRST}.area_m", ["reaches beyond the site", "[200, 0]"]),
+        (f"{SURVEY}.area_m=[[0, 0], [5, 0], [5, 60], [0, 60]]", f"{FIRST}.area_m", ["no room for one", "10 m"]),
+        (f"{SURVEY}.line_spacing_m=130", FIRST, ["no room for one survey line", "smaller line_spacing_m"]),
+        ("phases.search.settings.target=[0, 90]", "phases.1.settings.target", ["the target lies outside"]),
+        (f"phases.1={ROUND}", "phases.1.settings.points.1", ["the waypoint lies outside the site", "y from -70 to 70"]),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit(mission: Path, site: SiteModel, override: str, path: str, fragments: list[str]) -> None:
+    problems = check_site(load_scenario(mission, [override]), site)
+    assert [problem.path for problem in problems] == [path]
+    for fragment in fragments:
+        assert fragment in str(problems[0])
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "sources.0.position_m=[0, 8]",  # in the hollow of the building, which is longer along y
+        "sources.0.position_m=[-30, 30]",  # in the hedge
+        "sources.0.position_m=[45, 22]",  # beside the wall
+        "sources.0={nuclide: Co-60, position_m: [45, 20], height_m: 4.5, activity_mbq: 1}",  # on top of the wall
+        "vehicles.uav1.position_m=[8, 0]",  # beside the building
+        f"{SURVEY}.area_m=[[0, 0], [12, 0], [12, 60], [0, 60]]",  # one line and a bit
+    ],
+)
+def test_what_fits_though_it_is_near(mission: Path, site: SiteModel, override: str) -> None:
+    assert check_site(load_scenario(mission, [override]), site) == []
+
+
+def test_the_members_of_a_formation_are_told_once(mission: Path, site: SiteModel) -> None:
+    formation = "{name: f, type: x500, position_m: [60, 60], formation: {count: 12, columns: 6, spacing_m: 6}}"
+    scenario = load_scenario(mission, [f"vehicles.uav3={formation}", "phases.survey.who=[f, uav1]"])
+    problems = check_site(scenario, site)
+    assert [(problem.path, problem.given) for problem in problems] == [("vehicles.2.position_m", "[84.0, 60.0]")]
+    assert "'f5' (and 3 more of its formation) starts outside the site" in str(problems[0])
+
+
+def test_everything_is_told_at_once_with_lines(mission: Path, site: SiteModel) -> None:
+    spoil(mission, "[12.0, 4.0]", "[90.0, 4.0]")
+    spoil(mission, "[-60.0, 35.0]", "[45.0, 20.0]")
+    problems = check_site(load_scenario(mission), site)
+    assert [(problem.path, problem.line) for problem in problems] == [
+        ("sources.0.position_m", line_of(mission, "[90.0")),
+        ("vehicles.2.position_m", line_of(mission, "[45.0")),
+    ]

@@ -1,0 +1,225 @@
+"""Missions as programs: overlapping phases, users' policies, other values without compiling, teams of every kind."""
+
+import textwrap
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import swarmsim
+
+FIELD = """
+name: {name}
+site: meadows
+engine: analytic
+timing: {{decision_period_s: 0.5}}
+sources: [{{nuclide: Co-60, position_m: [-200, 60], height_m: 0.5, activity_mbq: 2000}}]
+vehicles:
+{vehicles}
+phases:
+{phases}
+"""
+UAVS = "  - {name: uav, type: tarot_t650, position_m: [-190, 40], formation: {count: 2, columns: 2, spacing_m: 8}}"
+CLIMB = """
+import jax.numpy as jnp
+import swarmsim
+
+
+class Climb:
+    """Climb to a height, and remember how often it was asked."""
+
+    class Settings(swarmsim.PolicySettings):
+        height_m: float = 5.0
+
+    period_s = 0.1
+
+    def start(self, task, key):
+        return jnp.zeros(())
+
+    def act(self, task, memory, view, key):
+        target = jnp.append(task.home_m, view.position_m[2] - view.height_m + task.settings.height_m)
+        return memory + 1.0, swarmsim.go_to(target)
+
+    def done(self, task, memory, view):
+        return jnp.abs(view.height_m - task.settings.height_m) < 0.3
+"""
+
+
+def written(folder, name: str, vehicles: str, phases: str):
+    path = folder / f"{name}.yaml"
+    path.write_text(FIELD.format(name=name, vehicles=vehicles, phases=textwrap.indent(phases, "  ")), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def climbing(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("climb")
+    (folder / "my.py").write_text(CLIMB, encoding="utf-8")
+    phases = "- {name: up, who: uav, policy: 'my.py:Climb', settings: {height_m: 6}, time_limit_s: 20}"
+    return swarmsim.build(swarmsim.load(written(folder, "climbing", UAVS, phases)))
+
+
+def test_a_users_policy_from_a_file_flies(climbing):
+    batch = climbing.rollout(0)
+    record = swarmsim.mission_record(climbing, batch, 0)
+    (phase,) = record.phases
+    assert phase.in_time
+    for vehicle in record.vehicles:
+        height = vehicle.position_m[-1, 2] - vehicle.position_m[0, 2]
+        assert height == pytest.approx(6.0, abs=0.4)
+    asked = np.asarray(batch.end.phases[0].memory)
+    ticks = round(float(batch.end.over_s[0]) / 0.5) * 50
+    np.testing.assert_allclose(asked, np.ceil(ticks / 10), atol=6)  # each 0.1 s; the last segment runs to its end
+
+
+def test_other_values_and_seeds_compile_nothing(climbing):
+    climbing.rollout([0, 1, 2])
+    values = {
+        "sources.0.activity_mbq": [100.0, 2000.0, 3000.0],
+        "wind.speed_m_s": [0.0, 3.0, 6.0],
+        "phases.up.settings.height_m": [4.0, 5.0, 7.0],
+    }
+    batch = climbing.rollout([7, 8, 9], values=values)
+    assert not batch.clock.compiled
+    records = [swarmsim.mission_record(climbing, batch, index) for index in range(3)]
+    assert [r.sources[0].activity_mbq for r in records] == pytest.approx([100.0, 2000.0, 3000.0])
+    for record, height in zip(records, (4.0, 5.0, 7.0), strict=True):
+        track = record.vehicles[0].position_m[:, 2]
+        assert track[-1] - track[0] == pytest.approx(height, abs=0.5)
+    # another simulation that differs in values only finds the programs of the first
+    other = swarmsim.build(
+        swarmsim.load(climbing.scenario.mission_file, ["wind.speed_m_s=4", "definitions.vehicles.tarot_t650.mass_kg=3.6"])
+    )
+    assert not other.rollout([1, 2, 3]).clock.compiled
+
+
+def test_values_that_change_more_than_values_are_refused(climbing):
+    with pytest.raises(swarmsim.InputError, match="a value for each mission"):
+        climbing.rollout([0, 1], values={"wind.speed_m_s": [1.0]})
+    with pytest.raises(swarmsim.InputError, match="changes more than a value"):
+        climbing.rollout([0], values={"timing.judge_period_s": [0.02]})
+    with pytest.raises(swarmsim.InputError, match="no field"):
+        climbing.rollout([0], values={"wind.sped_m_s": [1.0]})
+
+
+def test_phases_overlap_and_follow_one_another(tmp_path):
+    vehicles = UAVS + "\n  - {name: rover, type: orpheus, position_m: [-150, 60]}"
+    phases = """
+- {name: fly, who: uav, policy: waypoints, time_limit_s: 90,
+   settings: {points: [[-160, 30]], speed_m_s: 5, altitude_m: 10}}
+- {name: drive, who: rover, policy: waypoints, start: {at_s: 4}, time_limit_s: 60,
+   settings: {points: [[-145, 66]], speed_m_s: 1.0}}
+- {name: back, who: rover, policy: waypoints, start: {after: drive, delay_s: 2}, time_limit_s: 60,
+   settings: {points: [[-150, 60]], speed_m_s: 1.0}}
+"""
+    simulation = swarmsim.build(swarmsim.load(written(tmp_path, "overlap", vehicles, phases)))
+    record = swarmsim.mission_record(simulation, simulation.rollout(0), 0)
+    fly, drive, back = record.phases
+    assert all(phase.in_time for phase in record.phases)
+    assert fly.start_s == 0.0
+    assert drive.start_s == 4.0
+    assert drive.start_s < fly.end_s  # the rover set out while the UAVs still flew
+    assert drive.end_s + 2.0 <= back.start_s <= drive.end_s + 2.5
+    rover = record.vehicles[2]
+    np.testing.assert_allclose(rover.position_m[-1, :2], [-150.0, 60.0], atol=0.5)
+    for uav in record.vehicles[:2]:
+        assert np.linalg.norm(uav.position_m[-1] - uav.position_m[0]) < 0.6  # home again
+
+
+TEAMS = {
+    "quadrotors with hexarotors": "  - {name: a, type: tarot_t650, position_m: [-190, 40]}\n"
+    "  - {name: b, type: dji_f550, position_m: [-180, 40]}",
+    "T650 with x500": "  - {name: a, type: tarot_t650, position_m: [-190, 40]}\n"
+    "  - {name: b, type: x500, position_m: [-180, 40]}",
+    "several rovers": "  - {name: a, type: orpheus, position_m: [-190, 40]}\n"
+    "  - {name: b, type: orpheus, position_m: [-180, 40]}",
+    "UAVs and rovers": "  - {name: a, type: x500, position_m: [-190, 40]}\n"
+    "  - {name: b, type: orpheus, position_m: [-180, 40]}\n  - {name: c, type: dji_f550, position_m: [-170, 40]}",
+    "one UAV": "  - {name: a, type: x500, position_m: [-190, 40]}",
+}
+
+
+@pytest.mark.parametrize("team", TEAMS)
+def test_every_team_moves(team, tmp_path):
+    (tmp_path / "my.py").write_text(MOVE, encoding="utf-8")
+    phases = "- {name: move, who: all, policy: 'my.py:Move', time_limit_s: 4}"
+    simulation = swarmsim.build(swarmsim.load(written(tmp_path, "team", TEAMS[team], phases)))
+    record = swarmsim.mission_record(simulation, simulation.rollout(0), 0)
+    assert not any(vehicle.crashed for vehicle in record.vehicles)
+    for vehicle in record.vehicles:
+        moved = vehicle.position_m[-1] - vehicle.position_m[0]
+        assert moved[2 if vehicle.kind == "multirotor" else 0] > 1.0, vehicle.name
+        assert np.any(record.samples.vehicle == record.vehicles.index(vehicle))
+
+
+MOVE = """
+import jax.numpy as jnp
+import swarmsim
+
+
+class Move:
+    """Up, or ahead."""
+
+    def start(self, task, key):
+        return ()
+
+    def act(self, task, memory, view, key):
+        if hasattr(task.params, "rotor_spin"):
+            return memory, swarmsim.fly_velocity(jnp.array([0.0, 0.0, 1.0]))
+        return memory, swarmsim.DriveCommand(speed_m_s=jnp.float32(1.0), yaw_rate_rad_s=jnp.zeros(()))
+"""
+
+
+def test_a_vehicle_without_a_detector_flies(tmp_path):
+    bare = (
+        "  - {name: a, type: bare, position_m: [-190, 40]}\n  - {name: b, type: tarot_t650, position_m: [-180, 40]}\n"
+        "definitions: {vehicles: {bare: {extends: x500}}}"
+    )
+    (tmp_path / "my.py").write_text(MOVE, encoding="utf-8")
+    (tmp_path / "configs" / "vehicles").mkdir(parents=True)
+    spec = swarmsim.load("mixed").vehicles[2].model_dump(mode="json", exclude_none=True)
+    spec.pop("detector")
+    spec["sources"] = {key: text for key, text in spec["sources"].items() if not key.startswith("detector")}
+    import yaml
+
+    (tmp_path / "configs" / "vehicles" / "bare.yaml").write_text(yaml.safe_dump(spec | {"name": "bare"}))
+    folder = tmp_path / "configs" / "missions"
+    folder.mkdir()
+    (folder / "my.py").write_text(MOVE, encoding="utf-8")
+    phases = "- {name: move, who: all, policy: 'my.py:Move', time_limit_s: 3}"
+    path = written(folder, "bare_team", bare.split("\ndefinitions")[0], phases)
+    simulation = swarmsim.build(swarmsim.load(path))
+    record = swarmsim.mission_record(simulation, simulation.rollout(0), 0)
+    assert set(record.samples.vehicle) == {1}
+    assert all(vehicle.position_m[-1, 2] - vehicle.position_m[0, 2] > 1.0 for vehicle in record.vehicles)
+
+
+def test_stepping_by_hand_scans_and_batches(climbing):
+    world = climbing.world
+    missions, ticks = 3, 100
+
+    def fly(key):
+        state = swarmsim.reset(world, key)
+        (group,) = state.groups
+        above = group.vehicle.body.position_m + jnp.array([0.0, 0.0, 3.0])
+        command = swarmsim.PositionCommand(
+            position_m=above,
+            velocity_m_s=jnp.zeros((2, 3)),
+            acceleration_m_s2=jnp.zeros((2, 3)),
+            yaw_rad=jnp.zeros(2),
+            hold_position=jnp.ones(2),
+        )
+
+        def tick(state, _):
+            state, (reading,) = swarmsim.step(world, state, (command,))
+            return state, reading.fresh
+
+        return jax.lax.scan(tick, state, None, length=ticks)
+
+    state, fresh = jax.jit(jax.vmap(fly))(jax.vmap(jax.random.key)(jnp.arange(missions)))
+    rise = state.groups[0].vehicle.body.position_m[..., 2]
+    start = swarmsim.reset(world, jax.random.key(0)).groups[0].vehicle.body.position_m[:, 2]
+    assert np.all(np.asarray(rise) - np.asarray(start) > 0.5)
+    assert fresh.shape == (missions, ticks, 2)
+    np.testing.assert_array_equal(np.asarray(fresh).sum(axis=1), ticks // 9)  # a sample each 0.09 s

@@ -1,0 +1,315 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from swarmsim.world.neighbours import PUSH_FROM_M, Traffic, neighbours
+from tests.world.point_masses import HALF_HEIGHT_M, RADIUS_M, SEPARATION_M, flown, random_tour, speeds, tour, traffic
+
+nearby = jax.jit(neighbours, static_argnames=("count", "window", "dense_max"))
+
+ALL_PAIRS = 10_000
+
+
+def cloud(seed, count, per_vehicle_m2=900.0, depth=20.0):
+    side = np.sqrt(count * per_vehicle_m2)
+    return np.random.default_rng(seed).uniform(0.0, [side, side, depth], (count, 3)).astype(np.float32)
+
+
+# --- the K nearest ----------------------------------------------------------------------------------------------------
+
+
+def brute(position, reach, count):
+    distance = np.linalg.norm(position[:, None].astype(np.float64) - position[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    distance[~(distance <= reach)] = np.inf
+    index = np.argsort(distance, axis=1, kind="stable")[:, :count]
+    return index, np.take_along_axis(distance, index, axis=1)
+
+
+@pytest.mark.parametrize("dense_max", [0, ALL_PAIRS], ids=["cell list", "all pairs"])
+@pytest.mark.parametrize("size", [2, 5, 97, 300, 500])
+def test_the_nearest_are_exact(size, dense_max):
+    position = cloud(size, size)
+    found = nearby(jnp.asarray(position), jnp.float32(60.0), 6, dense_max=dense_max)
+    index, distance = brute(position, 60.0, 6)
+    kept = index.shape[1]
+    valid = np.isfinite(distance)
+    assert not bool(found.overflow)
+    np.testing.assert_array_equal(found.valid[:, :kept], valid)
+    np.testing.assert_allclose(found.distance_m[:, :kept], distance, rtol=1e-5)
+    np.testing.assert_array_equal(found.index[:, :kept], np.where(valid, index, np.arange(size)[:, None]))
+    assert not np.any(found.valid[:, kept:])
+    assert found.index.shape == found.distance_m.shape == found.valid.shape == (size, 6)
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**31), reach=st.floats(0.5, 300.0), scale=st.floats(1.0, 2000.0))
+def test_the_cell_list_finds_what_all_pairs_find_or_says_that_it_cannot(seed, reach, scale):
+    position = jnp.asarray(cloud(seed, 300, per_vehicle_m2=scale))
+    cells = nearby(position, jnp.float32(reach), 4, dense_max=0)
+    pairs = nearby(position, jnp.float32(reach), 4)
+    assert bool(cells.overflow) or np.allclose(cells.distance_m, pairs.distance_m, rtol=1e-6)
+    assert np.all(np.asarray(cells.distance_m) >= np.asarray(pairs.distance_m) * (1.0 - 1e-6))
+
+
+def test_everybody_in_one_cell_is_an_overflow():
+    position = jnp.asarray(cloud(0, 300, per_vehicle_m2=0.01))
+    assert bool(nearby(position, jnp.float32(50.0), 4, dense_max=0).overflow)
+    assert not bool(nearby(position, jnp.float32(50.0), 4, dense_max=0, window=300).overflow)
+    assert bool(traffic(position).overflow)
+    assert not bool(traffic(position, dense_max=300).overflow)
+
+
+def test_a_pair_on_both_sides_of_a_cell_border_is_found_everywhere():
+    rng = np.random.default_rng(0)
+    place = np.r_[rng.uniform(-5e3, 5e3, (150, 2)), 10.0 ** rng.uniform(0.0, 5.5, (150, 2))]
+    angle = rng.uniform(0.0, 2.0 * np.pi, 300)
+    place = np.c_[place, np.zeros(300)].astype(np.float32)
+    mate = place + 0.98 * np.c_[np.cos(angle), np.sin(angle), np.zeros(300)].astype(np.float32)
+    both = np.concatenate([place, mate])
+    found = nearby(jnp.asarray(both), jnp.float32(1.0), 8, dense_max=0)
+    _, distance = brute(both, 1.0, 8)
+    np.testing.assert_array_equal(found.valid, np.isfinite(distance))
+
+
+@pytest.mark.parametrize("dense_max", [0, ALL_PAIRS], ids=["cell list", "all pairs"])
+def test_outliers_and_diverged_vehicles_leave_the_others_alone(dense_max):
+    position = cloud(3, 300)
+    strange = position.copy()
+    strange[[4, 50]] = [[1e6, -1e6, 3.0], [-1e6, 1e6, 1e6]]
+    strange[[7, 8, 9]] = [[np.nan, 0.0, 0.0], [np.inf, 1.0, 2.0], [1e30, 0.0, 0.0]]
+    odd = [4, 50, 7, 8, 9]
+    rest = np.setdiff1d(np.arange(300), odd)
+    found = nearby(jnp.asarray(strange), jnp.float32(40.0), 5, dense_max=dense_max)
+    alone = nearby(jnp.asarray(position[rest]), jnp.float32(40.0), 5)
+    np.testing.assert_allclose(found.distance_m[rest], alone.distance_m, rtol=1e-6)
+    assert not np.any(found.valid[np.array(odd)])
+    assert not bool(found.overflow)
+    rules = traffic(strange, dense_max=dense_max)
+    np.testing.assert_array_equal(rules.hold[rest], traffic(position[rest]).hold)
+    for leaf in (rules.push_m, rules.hold[np.array(odd)], rules.collided[np.array(odd)]):
+        assert not np.any(np.isnan(leaf))
+    assert not np.any(rules.hold[np.array(odd)])
+
+
+def test_a_mission_alone_and_in_a_batch_has_the_same_neighbours():
+    position = jnp.stack([jnp.asarray(cloud(seed, 120)) for seed in range(3)])
+    for dense_max in (0, ALL_PAIRS):
+        one = lambda p: nearby(p, jnp.float32(50.0), 3, dense_max=dense_max)  # noqa: B023, E731
+        batch = jax.jit(jax.vmap(one))(position)
+        for i in range(3):
+            alone = one(position[i])
+            np.testing.assert_array_equal(batch.index[i], alone.index)
+            np.testing.assert_allclose(batch.distance_m[i], alone.distance_m, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dense_max", [0, ALL_PAIRS], ids=["cell list", "all pairs"])
+def test_gradients_are_finite_and_right(dense_max):
+    position = jnp.asarray(cloud(5, 20, per_vehicle_m2=9.0, depth=4.0)).at[3].set(jnp.nan)
+    position = position.at[11].set(position[12])  # coincident
+
+    def spread(p):
+        near = nearby(p, jnp.float32(8.0), 3, dense_max=dense_max)
+        rules = traffic(p, jnp.ones((20, 3)), dense_max=dense_max)
+        nearest = jnp.where(jnp.isfinite(rules.nearest_m), rules.nearest_m, 0.0)
+        return jnp.sum(jnp.where(near.valid, near.distance_m, 0.0)) + jnp.sum(nearest) + jnp.sum(rules.push_m**2)
+
+    assert np.all(np.isfinite(jax.jit(jax.grad(spread))(position)))
+    pair = jnp.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]])
+    gradient = jax.grad(lambda p: nearby(p, jnp.float32(9.0), 1, dense_max=dense_max).distance_m[0, 0])(pair)
+    np.testing.assert_allclose(gradient, [[-0.6, -0.8, 0.0], [0.6, 0.8, 0.0]], atol=1e-6)
+
+
+def test_memory_grows_with_the_number_and_not_with_its_square():
+    def bytes_of(count):
+        rules = jax.jit(lambda p, v: traffic(p, v)).lower(jnp.zeros((count, 3)), jnp.zeros((count, 3)))
+        return rules.compile().memory_analysis().temp_size_in_bytes
+
+    small, large = bytes_of(1000), bytes_of(2000)
+    assert large < 2.2 * small
+    assert small < 40e6
+
+
+# --- the rules --------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 2**31), size=st.integers(2, 400))
+def test_both_searches_give_the_same_rules(seed, size):
+    rng = np.random.default_rng(seed)
+    position = cloud(seed, 400, per_vehicle_m2=60.0)
+    position[size:] = np.nan
+    velocity = rng.normal(0.0, 3.0, (400, 3)) * (rng.random((400, 1)) < 0.6)
+    given = {"flies": rng.random(400) < 0.8, "active": rng.random(400) < 0.8, "rank": rng.permutation(400)}
+    given["height_m"] = np.where(given["flies"], rng.uniform(0.0, 20.0, 400), 0.0).astype(np.float32)
+    cells, pairs = (traffic(position, velocity, dense_max=d, window=128, **given) for d in (0, ALL_PAIRS))
+    assert not bool(cells.overflow)
+    for name in ("hold", "collided", "nearest_m"):
+        np.testing.assert_allclose(getattr(cells, name), getattr(pairs, name), rtol=1e-6)
+    # With more encounters than are counted, the two searches count different ones.
+    few = np.linalg.norm(np.asarray(pairs.push_m) - np.asarray(cells.push_m), axis=1) < 1e-3
+    assert np.mean(few) > 0.95
+    assert np.all(few | np.asarray(pairs.hold))
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 2**31), side=st.floats(2.0, 80.0))
+def test_the_first_in_precedence_never_waits(seed, side):
+    rng = np.random.default_rng(seed)
+    height = rng.choice([0.0, 0.5, 2.0, 20.0], 12).astype(np.float32)
+    rank = rng.permutation(12)
+    position = np.c_[rng.uniform(0.0, side, (12, 2)), height]
+    result = traffic(position, rng.normal(0.0, 4.0, (12, 3)), height_m=height, rank=rank)
+    order = rank + np.where(height > PUSH_FROM_M, 0, 12)
+    assert not bool(result.hold[np.argmin(order)])
+    assert np.all(np.linalg.norm(result.push_m, axis=1) <= SEPARATION_M + 1e-4)
+    assert np.all(np.asarray(result.push_m)[height <= PUSH_FROM_M] == 0.0)
+    assert np.all(np.asarray(result.push_m)[~np.asarray(result.hold)] == 0.0)
+
+
+def holds(position, velocity=None, **changes):
+    return list(np.asarray(traffic(position, velocity, **changes).hold))
+
+
+def test_of_two_in_flight_the_later_rank_waits():
+    pair = [[0.0, 0.0, 20.0], [5.9, 0.0, 20.0]]
+    assert holds(pair) == [False, True]
+    assert holds(pair, rank=[9, 4]) == [True, False]
+    assert holds([[0.0, 0.0, 20.0], [6.1, 0.0, 20.0]]) == [False, False]
+    assert holds([[0.0, 0.0, 20.0], [0.0, 0.0, 26.1]]) == [False, False]
+    assert holds(pair, active=[False, True]) == [False, False]
+    assert holds(pair, active=[True, False]) == [False, False]
+
+
+def test_one_in_flight_goes_before_one_on_the_ground():
+    pair = [[0.0, 0.0, 0.2], [1.6, 0.0, 4.0]]
+    assert holds(pair, height_m=[0.0, 3.8]) == [True, False]
+    assert holds([[0.0, 0.0, 0.2], [1.6, 0.0, 0.2]], height_m=[0.0, 0.0]) == [False, True]
+
+
+def test_rovers_wait_for_rovers_only_and_are_not_pushed():
+    near = [[0.0, 0.0, 0.3], [1.9, 0.0, 0.3]]
+    ground = {"height_m": [0.0, 0.0]}
+    assert holds(near, flies=[False, False], **ground) == [False, True]
+    assert holds([[0.0, 0.0, 0.3], [2.1, 0.0, 0.3]], flies=[False, False], **ground) == [False, False]
+    assert holds(near, flies=[False, True], **ground) == [False, False]
+    assert holds(near, flies=[True, False], **ground) == [False, False]
+    assert np.all(traffic(near, flies=[False, False]).push_m == 0.0)
+
+
+def test_one_that_closes_in_waits_before_the_separation_is_lost():
+    apart = [[0.0, 0.0, 20.0], [14.0, 0.0, 20.0]]
+    assert holds(apart, [[0.0, 0.0, 0.0], [-5.0, 0.0, 0.0]]) == [False, True]
+    assert holds(apart, [[5.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) == [False, True]
+    assert holds(apart, [[-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]]) == [False, False]  # behind it, as fast
+    assert holds(apart, [[0.0, 5.0, 0.0], [0.0, 5.0, 0.0]]) == [False, False]  # on parallel lines
+    assert holds(apart, [[5.0, 0.0, 0.0], [0.0, 8.0, 0.0]]) == [False, False]  # out of its way in time
+
+
+def test_the_push_is_across_the_way_of_the_other():
+    result = traffic([[0.0, 0.0, 20.0], [8.0, 2.0, 20.0]], [[5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    east, north, up = np.asarray(result.push_m[1])
+    assert abs(east) < 0.02
+    assert north > 2.0
+    assert up > 0.0
+    head_on = traffic([[0.0, 0.0, 20.0], [8.0, 0.0, 20.0]], [[5.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    assert float(head_on.push_m[1, 1]) < -1.0  # to the right of one that comes east
+    below = traffic([[0.0, 0.0, 20.0], [0.0, 0.0, 17.0]])
+    assert float(below.push_m[1, 2]) < -2.0
+
+
+@pytest.mark.parametrize(("height", "share"), [(0.0, 0.0), (1.0, 0.0), (2.0, 0.5), (3.0, 1.0), (20.0, 1.0)])
+def test_the_push_fades_towards_the_ground_and_never_leads_into_it(height, share):
+    pair = [[0.0, 0.0, height], [4.0, 0.0, height]]
+    result = traffic(pair, height_m=[20.0, height])
+    full = traffic(pair)
+    np.testing.assert_allclose(result.push_m[1, :2], share * full.push_m[1, :2], atol=1e-5)
+    above = traffic([[0.0, 0.0, height + 3.0], [0.0, 0.0, height]], height_m=[height + 3.0, height])
+    assert float(above.push_m[1, 2]) >= -max(height - 3.0, 0.0) - 1e-6
+
+
+def collisions(position, **changes):
+    return list(np.asarray(traffic(position, **changes).collided))
+
+
+def test_collisions_are_overlaps_of_upright_cylinders():
+    level, over = 2.0 * RADIUS_M, 2.0 * HALF_HEIGHT_M
+    assert collisions([[0.0, 0.0, 9.0], [0.99 * level, 0.0, 9.0]]) == [True, True]
+    assert collisions([[0.0, 0.0, 9.0], [1.01 * level, 0.0, 9.0]]) == [False, False]
+    assert collisions([[0.0, 0.0, 9.0], [0.0, 0.0, 9.0 + 0.99 * over]]) == [True, True]
+    assert collisions([[0.0, 0.0, 9.0], [0.0, 0.0, 9.0 + 1.01 * over]]) == [False, False]
+
+
+def test_one_under_way_collides_with_any_that_is_there_and_those_at_rest_with_none():
+    pair = [[0.0, 0.0, 0.2], [1.0, 0.0, 0.2]]
+    assert collisions(pair, active=[True, False]) == [True, True]
+    assert collisions(pair, active=[False, False]) == [False, False]
+    assert collisions(pair, flies=[True, False]) == [True, True]
+    beside = [[0.0, 0.0, 0.2], [1.1, 0.0, 0.4]]
+    assert collisions(beside, flies=[True, False], radius_m=[0.5, 0.55]) == [False, False]
+    assert collisions(beside, flies=[True, False], radius_m=[0.5, 0.65]) == [True, True]
+
+
+def test_the_distance_of_the_nearest_is_given_within_the_separation():
+    result = traffic([[0.0, 0.0, 9.0], [3.0, 0.0, 13.0], [40.0, 0.0, 9.0]])
+    np.testing.assert_allclose(result.nearest_m, [5.0, 5.0, np.inf])
+
+
+# --- flights of point masses ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fly():
+    return jax.jit(flown)
+
+
+def test_teams_on_any_pads_take_off_cross_and_land_without_touching_or_waiting_for_ever():
+    ways = jnp.stack([random_tour(seed) for seed in range(64)])
+    result = jax.jit(jax.vmap(flown, (0, None)))(ways, speeds(5))
+    exists = np.isfinite(np.asarray(ways)[:, :, 0, 0])
+    assert not np.any(result.collided)
+    np.testing.assert_array_equal(result.landed, exists)
+
+
+@pytest.mark.parametrize("cruise", [2.0, 5.0, 8.0])
+@pytest.mark.parametrize("aside", [0.0, 0.5, 3.0])
+def test_two_that_meet_head_on_pass_each_other(fly, cruise, aside):
+    pads = np.array([[-50.0, 0.0], [50.0, aside]])
+    result = fly(tour(pads, pads[::-1] * [1.0, 0.0] + pads * [0.0, 1.0]), speeds(4, cruise))
+    assert np.all(result.landed)
+    assert np.all(np.asarray(result.nearest_m) > 2.5)
+
+
+def test_two_land_side_by_side_at_the_same_time(fly):
+    pads = np.array([[0.0, 0.0], [1.6, 0.0]])
+    for stops in ([[40.0, 0.0], [-40.0, 0.0]], [[-40.0, 0.0], [40.0, 0.0]], [[30.0, 0.0], [30.0, 9.0]]):
+        result = fly(tour(pads, np.array(stops)), speeds(4))
+        assert np.all(result.landed)
+        assert not np.any(result.collided)
+
+
+def test_one_passes_over_others_that_wait(fly):
+    pads = np.array([[-30.0, 0.0], [0.0, 0.0], [1.6, 0.0], [3.2, 0.0]])
+    stops = np.array([[30.0, 0.0], [0.0, 20.0], [1.6, 20.0], [3.2, 20.0]])
+    result = fly(tour(pads, stops), speeds(4))
+    assert np.all(result.landed)
+    assert not np.any(result.collided)
+
+
+def test_a_dense_grid_of_pads_takes_off_one_after_another(fly):
+    pads = 1.53 * np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0)), axis=-1).reshape(-1, 2)
+    angle = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    result = fly(tour(pads, 60.0 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)), speeds(4))
+    assert np.all(result.landed)
+    assert not np.any(result.collided)
+    assert float(result.time_s) < 20 * 20.0
+
+
+def test_traffic_is_a_pytree_of_arrays():
+    assert isinstance(jax.tree.map(lambda x: x, traffic([[0.0, 0.0, 5.0]])), Traffic)
+    alone = traffic([[0.0, 0.0, 5.0]])
+    assert not np.any(alone.hold)
+    assert np.isinf(alone.nearest_m[0])
