@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from swarmsim.config.errors import InputError
@@ -92,7 +93,7 @@ def bench_scenario(name: str, missions: int, repeats: int, overrides: Sequence[s
         column.justify = "right"
     for program in dict.fromkeys((*together.programs_s, *alone.programs_s)):
         times = (speed.programs_s.get(program) for speed in (alone, together))
-        table.add_row(f"{program} [s]", *("" if time is None else f"{time:.3f}" for time in times))
+        table.add_row(escape(f"{program} [s]"), *("" if time is None else f"{time:.3f}" for time in times))
     for label, one, all_ in (
         ("simulated [s]", alone.simulated_s, together.simulated_s),
         ("rollout [s]", alone.run_s, together.run_s),
@@ -100,7 +101,7 @@ def bench_scenario(name: str, missions: int, repeats: int, overrides: Sequence[s
         ("real-time factor", alone.real_time_factor, together.real_time_factor),
         ("throughput against one at a time", 1.0, together.real_time_factor / alone.real_time_factor),
     ):
-        table.add_row(label, f"{one:,.2f}", f"{all_:,.2f}")
+        table.add_row(escape(label), f"{one:,.2f}", f"{all_:,.2f}")
     Console().print(table)
 
 

@@ -14,13 +14,14 @@ from swarmsim.config.documents import Place
 from swarmsim.config.errors import Problem
 from swarmsim.config.policies import ApproachAndOrbit, Orbit, ParallelLines, Waypoints, line_spacing
 from swarmsim.config.scenario import Scenario
-from swarmsim.config.vehicles import SkidSteer
+from swarmsim.config.vehicles import Multirotor, SkidSteer
 
 if TYPE_CHECKING:
     from swarmsim.site import Site, SiteModel
 
 Floats = NDArray[np.float64]
 
+OVERHEAD_M = 0.4  # a surface this far above the terrain is an obstacle to a UAV, not ground
 POROUS_KG_M3 = 100.0  # a thing of a lower bulk density is foliage or straw: a source can lie in it
 
 
@@ -48,6 +49,7 @@ class _Ground:
     def __init__(self, site: Site, scenario: Scenario):
         self.cell = float(site.cell_m)
         self.terrain = np.asarray(site.terrain_m, float)
+        self.surface = np.asarray(site.surface_m, float)
         self.clearance = np.asarray(site.clearance_m, float)
         self.low = np.asarray(site.origin_m, float) - self.cell / 2
         self.high = self.low + self.cell * np.array(self.terrain.shape[::-1])
@@ -75,6 +77,14 @@ class _Ground:
         rows, columns = raster.shape
         column, row = np.clip(((xy - self.low) / self.cell).astype(int), 0, [columns - 1, rows - 1])
         return float(raster[row, column])
+
+    def rises_within(self, xy: Floats, radius: float) -> float:
+        """How far the highest surface rises above the ground within ``radius`` of ``xy`` [2], m."""
+        rows, columns = self.terrain.shape
+        corners = np.stack([xy - radius, xy + radius])
+        (left, low), (right, high) = np.clip(((corners - self.low) / self.cell).astype(int), 0, [columns - 1, rows - 1])
+        window = np.s_[low : high + 1, left : right + 1]
+        return float(np.max(self.surface[window] - self.terrain[window]))
 
     def depth(self, point: Floats) -> Floats:
         """How deep a point [3] lies within each box, along the box's own axes [K, 3]; < 0 outside."""
@@ -143,6 +153,10 @@ def _start_fault(scenario: Scenario, ground: _Ground, i: int) -> tuple[str, dict
         return f"inside an obstacle of {ground.material[k]}, or touches it", {
             "allowed": f"at least {radius:.2f} m from every obstacle",
             "suggestion": f"the obstacle's centre is at {_point(ground.centre[k, :2])}",
+        }
+    if isinstance(vehicle, Multirotor) and ground.rises_within(xy, radius + ground.cell) > OVERHEAD_M:
+        return "below something that stands there, such as a tree or a roof", {
+            "allowed": f"a place with nothing above the ground within {radius:.2f} m"
         }
     if isinstance(vehicle, SkidSteer) and ground.cell_value(ground.clearance, xy) <= 0:
         return "where a rover cannot drive (obstacle, closed zone or edge of the site)", {

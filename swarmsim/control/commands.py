@@ -135,7 +135,7 @@ def fly_velocity(velocity_m_s: jax.Array, yaw_rad: jax.Array | float = 0.0) -> P
 def multirotor_command(command: object, rotors: int) -> MultirotorCommand:
     """The full command [one vehicle] of what a policy returned; ``rotors`` is the number of rotors.
 
-    Raises TypeError for anything that does not command a multirotor.
+    Raises TypeError for anything that does not command a multirotor, and for a wrong shape.
     """
     zero3 = jnp.zeros(3)
     level = {PositionCommand: POSITION, AttitudeCommand: ATTITUDE, BodyRateCommand: BODY_RATE}
@@ -157,7 +157,7 @@ def multirotor_command(command: object, rotors: int) -> MultirotorCommand:
 def skid_steer_command(command: object) -> SkidSteerCommand:
     """The full command [one vehicle] of what a policy returned.
 
-    Raises TypeError for anything that does not command a skid-steer rover.
+    Raises TypeError for anything that does not command a skid-steer rover, and for a wrong shape.
     """
     level = {DriveToCommand: DRIVE_TO, DriveCommand: DRIVE}
     whole = SkidSteerCommand(
@@ -171,10 +171,9 @@ def skid_steer_command(command: object) -> SkidSteerCommand:
 
 
 def _filled(whole: T, command: object, classes: tuple[type, ...], kind: str) -> T:
-    if isinstance(command, type(whole)):
-        return command
+    classes = (*classes, type(whole))
     if not isinstance(command, classes):
-        names = ", ".join(c.__name__ for c in (*classes, type(whole)))
+        names = ", ".join(c.__name__ for c in classes)
         raise TypeError(f"a {kind} is commanded by one of {names}, not by {type(command).__name__}")
     given = vars(command)
     fields = {}

@@ -155,13 +155,19 @@ def _outline_buildings(axes: Axes, site_model: SiteModel) -> None:
 
 
 def driven_measurements(phase: Phase, record: MissionRecord, site_model: SiteModel) -> Figure:
-    """Count rates of a phase that was driven, along the planned paths, with a close-up of the place that it reached."""
+    """Count rates of a phase that was driven, along the planned paths, with a close-up.
+
+    The close-up shows the estimate, or the greatest count rate where the phase did not come near the estimate.
+    """
     samples = record.samples.of_phase(phase.name)
-    centre, half = _close_up(record.estimate, samples.position_m[-1:, :2], site_model)
-    figure, whole, close = plan.new_pair(site_model, centre, half)
     rate = smoothed_rate(samples)
     norm = log_scale(rate).norm
     x, y, _ = samples.position_m.T
+    strongest = samples.position_m[[np.argmax(rate)], :2]
+    centre, half = _close_up(record.estimate, strongest, site_model)
+    if not ((abs(x - centre[0]) < half) & (abs(y - centre[1]) < half)).any():
+        centre, half = _close_up(None, strongest, site_model)
+    figure, whole, close = plan.new_pair(site_model, centre, half)
     paths = [record.paths_m[number] for number in phase.vehicles if number in record.paths_m]
     for axes, size in ((whole, 5.0), (close, 14.0)):
         for k, path in enumerate(paths):

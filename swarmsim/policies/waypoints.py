@@ -93,12 +93,14 @@ def _drive(
     grid = route_grid(site, radius, task.block, position[:2])
     steps = 2 * sum(grid.cost.shape)
 
-    def leg(here: jax.Array, goal: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def leg(here: jax.Array, corner: jax.Array) -> tuple[jax.Array, jax.Array]:
+        goal = grid.cell_of(corner)
         field = cost_to_go(grid.cost, goal, grid.cell_m)
         cells = descend(field, grid.cost, here, grid.cell_m, steps)
-        return cells[-1], cells
+        reached = jnp.all(cells[-1] == goal)
+        xy = grid.place(cells)
+        return cells[-1], xy.at[-1].set(jnp.where(reached, corner, xy[-1]))
 
-    start = grid.cell_of(position[:2])
-    _, legs = jax.lax.scan(leg, start, grid.cell_of(task.corners_m))
-    xy = grid.place(legs.reshape(-1, 2)).at[0].set(position[:2])
+    _, legs = jax.lax.scan(leg, grid.cell_of(position[:2]), task.corners_m)
+    xy = legs.reshape(-1, 2).at[0].set(position[:2])
     return ground_path(site, xy, task.speed_m_s, acceleration, task.points)

@@ -8,6 +8,8 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as RichBar
 
+_NAME_WIDTH = 28  # of the longest name of phases that is shown in full
+
 
 class Progress(Protocol):
     """What a rollout reports to, from the host and between compiled segments only."""
@@ -46,7 +48,7 @@ class RichProgress:
         """Draw on ``console`` (standard error when None)."""
         self._missions = missions
         self._bar = RichBar(
-            TextColumn("{task.description:<24}"),
+            TextColumn(f"{{task.description:<{_NAME_WIDTH}}}"),
             BarColumn(),
             TextColumn("{task.fields[simulated]:>18}"),
             TextColumn("{task.fields[speed]:>14}"),
@@ -72,7 +74,8 @@ class RichProgress:
         """End the bar before and begin that of the phase."""
         self._close()
         self._horizon_s, self._first = simulated_horizon_s, None
-        self._task = self._bar.add_task(name, total=None, simulated="", speed="")
+        short = name if len(name) <= _NAME_WIDTH else f"{name[: _NAME_WIDTH - 2]} …"
+        self._task = self._bar.add_task(short, total=None, simulated="", speed="")
 
     def advance(self, simulated_s: float, done: int, total: int) -> None:
         """Move the bar of the phase."""

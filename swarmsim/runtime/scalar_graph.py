@@ -18,7 +18,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 Scalar = Any  # np.generic | Node
 FOLD_LIMIT = 1024
 """Largest constant array, in elements, that is computed on the host."""
-STORED_COST = 40.0
+STORED_COST = 80.0
 """Operations that are worth a result in memory (measured on a CPU with vectors of eight)."""
 
 

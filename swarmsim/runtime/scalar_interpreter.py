@@ -63,6 +63,10 @@ class Interpreter:
         jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
         known = {v: self.constant(x, v.aval) for v, x in zip(jaxpr.constvars, consts, strict=True)}
         known.update(zip(jaxpr.invars, inputs, strict=True))
+        return self.evaluate(jaxpr, known, wanted)
+
+    def evaluate(self, jaxpr: Any, known: dict[Any, Value], wanted: Sequence[bool] | None = None) -> list[Value]:
+        """Outputs of a jaxpr, given the values of its constants and inputs."""
 
         def read(variable: Any) -> Value:
             return self.constant(variable.val, variable.aval) if isinstance(variable, core.Literal) else known[variable]
@@ -125,8 +129,7 @@ class Interpreter:
 
     def constant(self, value: Any, aval: Any) -> Value:
         """Value that all vehicles share: numbers if it is known while tracing and not too large."""
-        known = not isinstance(value, jax.core.Tracer) and not jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended)
-        if known and is_small(aval, FOLD_LIMIT) and getattr(value, "is_fully_addressable", True):
+        if is_foldable(value, aval):
             return np.asarray(value, aval.dtype)
         return self.take_apart(value, False, aval)
 
@@ -244,6 +247,12 @@ def is_small(aval: Any, limit: int) -> bool:
         return False
     size = math.prod(aval.shape)
     return size <= limit and not (size == 0 and jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended))
+
+
+def is_foldable(value: Any, aval: Any) -> bool:
+    """Whether a value is known while tracing, and is computed with on the host."""
+    known = not isinstance(value, jax.core.Tracer) and not jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended)
+    return known and is_small(aval, FOLD_LIMIT) and getattr(value, "is_fully_addressable", True)
 
 
 def is_number(value: Value) -> bool:

@@ -5,24 +5,28 @@ pass intermediates through memory. Here every small array of the function is tak
 that nearly everything is elementwise and is fused.
 """
 
-import functools
 from collections.abc import Callable
+from functools import partial, wraps
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.runtime.scalar_control import CONTROL
-from swarmsim.runtime.scalar_graph import Graph, varying_axes
-from swarmsim.runtime.scalar_interpreter import UNROLL, Interpreter
+from swarmsim.runtime.scalar_interpreter import UNROLL, is_foldable
+from swarmsim.runtime.scalar_program import Program, on_cpu
 
 Layout = Literal["scalars", "vmap"]
 LAYOUTS = ("scalars", "vmap")
 
 
 def over_vehicles(
-    function: Callable[..., Any], in_axes: Any = 0, layout: Layout = "scalars", *, unroll: int = UNROLL
+    function: Callable[..., Any],
+    in_axes: Any = 0,
+    layout: Layout = "scalars",
+    *,
+    unroll: int = UNROLL,
+    platform: str | None = None,
 ) -> Callable[..., Any]:
     """`jax.vmap` of a function of one vehicle, by default as operations on scalars [N].
 
@@ -41,6 +45,7 @@ def over_vehicles(
             Keyword arguments are mapped over axis 0. All results have the vehicles' axis in front.
         layout: ``scalars``, or ``vmap`` for `jax.vmap` itself.
         unroll: longest `jax.lax.scan` inside ``function`` that is written out; longer ones carry scalars.
+        platform: that the program will run on, by default JAX's own; see `swarmsim.runtime.scalar_program.on_cpu`.
 
     Raises:
         ValueError: for an unknown layout, or, when called, for arguments that do not fit ``in_axes``.
@@ -50,7 +55,7 @@ def over_vehicles(
     if layout == "vmap":
         return jax.vmap(function, in_axes=in_axes)
 
-    @functools.wraps(function, updated=())
+    @wraps(function, updated=())
     def mapped(*args: Any, **kwargs: Any) -> Any:
         axes = tuple(in_axes) if isinstance(in_axes, (tuple, list)) else (in_axes,) * len(args)
         if len(axes) != len(args):
@@ -62,7 +67,11 @@ def over_vehicles(
             x if axis in (None, 0) else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, leaf_axes, strict=True)
         ]
         varied = [axis is not None for axis in leaf_axes]
-        return _evaluate(function, tree, moved, varied, size, unroll)
+        program, arrays, structure = _program(function, tree, moved, varied, unroll)
+        of_vehicle = [False] * (len(arrays) - sum(varied)) + [True] * sum(varied)
+        cpu = (platform or jax.default_backend()) == "cpu"
+        evaluate = on_cpu(program, size, of_vehicle) if cpu else partial(program.evaluate, size, of_vehicle)
+        return jax.tree.unflatten(structure, evaluate(*arrays))
 
     return mapped
 
@@ -91,10 +100,8 @@ def _vehicles(leaves: list[Any], axes: list[int | None]) -> int:
     return sizes.pop()
 
 
-def _evaluate(
-    function: Callable[..., Any], tree: Any, leaves: list[Any], varied: list[bool], size: int, unroll: int
-) -> Any:
-    """Results of ``function`` for the leaves of its arguments, of which those that are ``varied`` have axis N."""
+def _program(function: Callable[..., Any], tree: Any, leaves: list[Any], varied: list[bool], unroll: int) -> Any:
+    """The function of one vehicle as a `Program` with its arguments, and the structure of its results."""
     inputs = [x for x, of_vehicle in zip(leaves, varied, strict=True) if of_vehicle]
     types = [jax.typeof(x) for x in inputs]
     one = [jax.ShapeDtypeStruct(t.shape[1:], t.dtype, weak_type=t.weak_type) for t in types]
@@ -106,12 +113,12 @@ def _evaluate(
         return function(*args, **kwargs)
 
     closed, shape = jax.make_jaxpr(of_one, return_shape=True)(*one)
-    shared = [x for x in closed.consts if isinstance(x, jax.Array)]
-    varying = frozenset().union(*map(varying_axes, [*inputs, *shared]))
-    interpreter = Interpreter(Graph(size, varying, stores=jax.default_backend() == "cpu"), CONTROL, unroll)
-    values = [interpreter.take_apart(x, True, v.aval) for x, v in zip(inputs, closed.jaxpr.invars, strict=True)]
-    with np.errstate(all="ignore"):  # folded constants follow IEEE 754 without a word, as on the device
-        results = interpreter.run(closed, values)
-        interpreter.settle(results)
-    arrays = [interpreter.mapped_array(r, v.aval) for r, v in zip(results, closed.jaxpr.outvars, strict=True)]
-    return jax.tree.unflatten(jax.tree.structure(shape), arrays)
+    constants, variables, shared = {}, [], []
+    for variable, value in zip(closed.jaxpr.constvars, closed.consts, strict=True):
+        if is_foldable(value, variable.aval):
+            constants[variable] = np.asarray(value, variable.aval.dtype)
+        else:
+            variables.append(variable)
+            shared.append(value)
+    program = Program(closed.jaxpr, constants, (*variables, *closed.jaxpr.invars), unroll)
+    return program, [*shared, *inputs], jax.tree.structure(shape)

@@ -137,8 +137,8 @@ class Simulation:
     def _check_alike(self, built: tuple[World, Plan], values: Mapping[str, Any]) -> None:
         """Refuse what would need another program: other sizes, or other static choices."""
         for own, other in zip((self.world, self.plan), built, strict=True):
-            same = jax.tree.structure(own) == jax.tree.structure(other)
-            if not same or jax.tree.map(np.shape, own) != jax.tree.map(np.shape, other):
+            (leaves, structure), (others, other_structure) = jax.tree.flatten(own), jax.tree.flatten(other)
+            if structure != other_structure or [*map(np.shape, leaves)] != [*map(np.shape, others)]:
                 raise InputError.of(
                     "changes more than a value (a number of things, a policy, a period, a size): missions of one batch "
                     "must agree in those",

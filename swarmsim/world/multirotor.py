@@ -42,10 +42,11 @@ def control_start() -> ControlMemory:
 
 
 def full_command(params: MultirotorParams, command: Any) -> Command:
-    """What a policy returned; a position command needs no other levels beside it."""
+    """What a policy returned, its shapes checked; a position command needs no other levels beside it."""
+    whole = multirotor_command(command, params.rotor_spin.shape[-1])
     if isinstance(command, PositionCommand):
-        return command
-    return multirotor_command(command, params.rotor_spin.shape[-1])
+        return PositionCommand(**{name: getattr(whole, name) for name in vars(command)})
+    return whole
 
 
 def stay(params: MultirotorParams, vehicle: MultirotorState) -> PositionCommand:

@@ -4,7 +4,7 @@ Pure and without a host call, so that `jax.jit`, `jax.vmap`, `jax.lax.scan` and 
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -103,10 +103,17 @@ def hold(world: World, state: WorldState) -> tuple[Any, ...]:
 
 def full_commands(world: World, commands: Sequence[Any]) -> tuple[Any, ...]:
     """Commands of all groups in the form that the step works on, their shapes checked."""
+    if not isinstance(commands, Sequence):
+        raise TypeError(f"commands are a sequence with one command for each group, not a {type(commands).__name__}")
     if len(commands) != len(world.groups):
         raise ValueError(f"there are {len(commands)} commands for {len(world.groups)} groups of vehicles")
     full = []
     for number, (group, command) in enumerate(zip(world.groups, commands, strict=True)):
+        if not is_dataclass(command):
+            raise TypeError(
+                f"the command of group {number} is a {type(command).__name__}: it must be one of the classes of "
+                "swarmsim.control.commands"
+            )
         for name, leaf in vars(command).items():
             if jnp.ndim(leaf) and jnp.shape(leaf)[0] != group.size:
                 raise ValueError(

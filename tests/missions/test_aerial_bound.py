@@ -7,8 +7,12 @@ import pytest
 from scipy.stats import chi2, kstest
 
 import swarmsim
-from swarmsim.estimation import cramer_rao_covariance, fisher_information
-from swarmsim.missions import keys, knowledge
+from swarmsim.estimation import Measurements, cramer_rao_covariance, fisher_information
+from swarmsim.estimation.windows import gather, measured, windows_start
+from swarmsim.missions import knowledge
+from swarmsim.radiation import draw_counts, observed_rate
+from swarmsim.sensors.radiation import source_rate
+from swarmsim.world.randomness import mission_keys
 
 SEEDS = 256
 # Fewer rounds, rays and places than a mission takes: the bound is asked for within 30 %, and there are 256 fits.
@@ -22,36 +26,54 @@ QUICK = (
 )
 
 
+# The survey of the shipped mission alone: the rover stays where it is.
+SURVEY = (
+    "phases=[{name: survey, who: multirotor, policy: parallel_lines, time_limit_s: 400,"
+    " settings: {altitude_m: 20.0, speed_m_s: 2.4}}]"
+)
+
+
 @pytest.fixture(scope="module")
 def survey():
     """The scenario `recon` with its source in the open, and what 256 missions learn from the counts of its flight."""
-    place = "sources.0.position_m=[50.0, -13.0]"
-    simulation = swarmsim.build(swarmsim.load("recon", ["engine=analytic", place, *QUICK]))
-    world, per_window = simulation.world, simulation.per_window
-    do, key = simulation.stages(1), keys.mission_keys(np.array([0]))
-    ticks = jnp.arange(round(330.0 / simulation.timing.uav_tick_s))
-    flights, log = do.fly(key, world, do.plan_survey(world), do.ready_to_fly(key, world), ticks)
-    assert np.all(np.min(np.asarray(flights.event_time_s), axis=-1) < 330.0)  # every UAV has landed
-    log = jax.tree.map(lambda leaf: leaf[0], log)
-    count = jax.jit(lambda key: knowledge.count_from_air(key, world, log))
+    common = ("engine=analytic", "sources.0.position_m=[50.0, -13.0]", SURVEY)
+    flown = swarmsim.build(swarmsim.load("recon", [*common, "localisation=null", "identification=null"]))
+    batch = flown.rollout(0)
+    simulation = swarmsim.build(swarmsim.load("recon", [*common, *QUICK]))
+    world, plan = simulation.world, simulation.plan
+    assert all(phase.in_time for phase in swarmsim.mission_record(flown, batch, 0).phases)  # every UAV has landed
+    samples = [segment.log.samples[0] for segment in batch.segments]
+    joined = jax.tree.map(lambda *parts: jnp.concatenate([part[0] for part in parts]), *samples)
+    counter = world.groups[0].counter
+    rate = jax.vmap(jax.vmap(lambda place, axis: source_rate(world.site, counter.detector, world.sources, place, axis)))
+    flat = jax.jit(lambda: observed_rate(counter.detector, rate(joined.position_m, joined.axis)))()
+    live_s = float(joined.exposure_s.max())
+
+    def windows(key):
+        counts, exposure = draw_counts(counter.detector, key, flat, live_s)
+        drawn = Measurements(
+            time_s=joined.time_s, position_m=joined.position_m, travel_m=joined.travel_m, axis=joined.axis,
+            counts=counts, exposure_s=exposure, valid=joined.new, detector=jnp.zeros(counts.shape, jnp.int32),
+        )  # fmt: skip
+        return measured(gather(windows_start(3, plan.windows[0]), drawn, joined.new, plan.per_window[0]), 0)
 
     def mission(key):
-        found = knowledge.learn_from_air(world, knowledge.count_from_air(key, world, log), per_window, 4)
+        found = knowledge.survey(plan, windows(key))
         return found.fit, found.found
 
-    mission_keys = keys.mission_keys(np.arange(SEEDS))
-    fits, found = jax.jit(lambda every: jax.lax.map(mission, every))(mission_keys)
-    return world, knowledge.windows(count(mission_keys[0]), per_window), jax.device_get(fits), np.asarray(found)
+    keys = mission_keys(np.arange(SEEDS))
+    fits, found = jax.jit(lambda every: jax.lax.map(mission, every))(keys)
+    return simulation, jax.jit(windows)(keys[0]), jax.device_get(fits), np.asarray(found)
 
 
 def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
-    world, windows, fits, found = survey
-    source = jax.tree.map(lambda leaf: leaf[0], world.sources)
-    detectors = knowledge.detectors(world)
+    simulation, windows, fits, found = survey
+    world, plan = simulation.world, simulation.plan
+    source = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), world.sources)
     information = jax.jit(lambda: fisher_information(
-        world.site, detectors, windows, source.position_m, source.activity_bq, source.nuclide, rays=6
+        world.site, plan.detectors, windows, source.position_m, source.activity_bq, source.nuclide, rays=6
     ))()  # fmt: skip
-    bound = np.sqrt(np.diag(cramer_rao_covariance(information, world.localisation.height_std_m)))[:2]
+    bound = np.sqrt(np.diag(cramer_rao_covariance(information, plan.localisation.height_std_m)))[:2]
     assert np.all((bound > 0.6) & (bound < 1.2))  # tens of centimetres from 20 m above: not a bound that says nothing
     error = fits.position_m[:, :2] - np.asarray(source.position_m)[:2]
     rmse = np.sqrt(np.mean(error**2, axis=0))
@@ -63,7 +85,8 @@ def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
 
 
 def test_the_aerial_estimate_knows_its_error(survey):
-    world, _, fits, _ = survey
+    simulation, _, fits, _ = survey
+    world = simulation.world
     error = fits.position_m[:, :2] - np.asarray(world.sources.position_m)[0, :2]
     normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance_m2[:, :2, :2]), error)
     assert kstest(normalised, chi2(2).cdf).pvalue > 1e-3

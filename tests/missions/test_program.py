@@ -21,7 +21,7 @@ phases:
 {phases}
 """
 UAVS = "  - {name: uav, type: tarot_t650, position_m: [-190, 40], formation: {count: 2, columns: 2, spacing_m: 8}}"
-CLIMB = """
+CLIMB = '''
 import jax.numpy as jnp
 import swarmsim
 
@@ -43,7 +43,7 @@ class Climb:
 
     def done(self, task, memory, view):
         return jnp.abs(view.height_m - task.settings.height_m) < 0.3
-"""
+'''
 
 
 def written(folder, name: str, vehicles: str, phases: str):
@@ -153,7 +153,7 @@ def test_every_team_moves(team, tmp_path):
         assert np.any(record.samples.vehicle == record.vehicles.index(vehicle))
 
 
-MOVE = """
+MOVE = '''
 import jax.numpy as jnp
 import swarmsim
 
@@ -168,7 +168,7 @@ class Move:
         if hasattr(task.params, "rotor_spin"):
             return memory, swarmsim.fly_velocity(jnp.array([0.0, 0.0, 1.0]))
         return memory, swarmsim.DriveCommand(speed_m_s=jnp.float32(1.0), yaw_rate_rad_s=jnp.zeros(()))
-"""
+'''
 
 
 def test_a_vehicle_without_a_detector_flies(tmp_path):

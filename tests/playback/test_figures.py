@@ -120,6 +120,16 @@ def test_driven_measurements_on_a_log_scale_with_a_close_up(found: MissionRecord
     assert "planned path" in labels(whole)
 
 
+def test_close_up_of_a_phase_far_from_the_estimate_shows_its_greatest_rate(
+    found: MissionRecord, site: SiteModel
+) -> None:
+    assert found.estimate is not None
+    elsewhere = dataclasses.replace(found.estimate, position_m=np.array([50.0, 45.0, 1.0]))
+    figure = figures.driven_measurements(found.phases[1], dataclasses.replace(found, estimate=elsewhere), site)
+    centre = np.mean([figure.axes[1].get_xlim(), figure.axes[1].get_ylim()], axis=1)
+    assert np.linalg.norm(centre - synthetic.SOURCE_M[:2]) < 6.0
+
+
 def test_spectrum_has_its_fit_lines_and_residuals(found: MissionRecord, site: SiteModel) -> None:
     figure = figures.spectrum(found, site)
     upper, lower = figure.axes

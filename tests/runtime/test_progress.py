@@ -32,3 +32,12 @@ def test_a_bar_needs_a_phase_and_silence_needs_nothing() -> None:
     silent.phase("survey", 1.0)
     silent.advance(1.0, 1, 1)
     silent.message("nothing")
+
+
+def test_a_long_name_leaves_room_for_the_bar() -> None:
+    screen = io.StringIO()
+    with RichProgress(Console(file=screen, force_terminal=True, width=100)) as progress:
+        progress.phase("survey_west + survey_east + first_look", 300.0)
+        progress.advance(100.0, 1, 3)
+    assert "survey_west + survey_east  …" in screen.getvalue()
+    assert "first_look" not in screen.getvalue()

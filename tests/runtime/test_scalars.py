@@ -1,5 +1,6 @@
 """`over_vehicles` against `jax.vmap`: every class of rule, transformations round it, and a controlled multirotor."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -39,15 +40,22 @@ def assert_alike(found, expected, rtol=1e-5, atol=1e-5):
         np.testing.assert_allclose(a, b, rtol=rtol, atol=atol)
 
 
+PLATFORMS = ("cpu", "gpu")  # how the program is arranged; both are run here
+on_gpu = partial(over_vehicles, platform="gpu")
+
+
 def check(function, *args, in_axes=0, **options):
-    found = jax.jit(over_vehicles(function, in_axes, **options))(*args)
-    assert_alike(found, jax.jit(jax.vmap(function, in_axes))(*args))
-    return found
+    """Compare with `jax.vmap`; returns the results."""
+    kinds = [over_vehicles(function, in_axes, platform=platform, **options) for platform in PLATFORMS]
+    *found, expected = jax.jit(lambda *args: [f(*args) for f in (*kinds, jax.vmap(function, in_axes))])(*args)
+    for results in found:
+        assert_alike(results, expected)
+    return found[0]
 
 
 def primitives_of(function, *args, in_axes=0):
     """Names of the primitives that are bound."""
-    return [e.primitive.name for e in jax.make_jaxpr(over_vehicles(function, in_axes))(*args).eqns]
+    return [e.primitive.name for e in jax.make_jaxpr(on_gpu(function, in_axes))(*args).eqns]
 
 
 x3, x4, x34, x33 = numbers(3), numbers(4, seed=1), numbers(3, 4, seed=2), numbers(3, 3, seed=3)
@@ -107,10 +115,13 @@ def test_derivatives(name):
             jnp.sum(leaf * jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape)) for leaf in jax.tree.leaves(mapped(x))
         )
 
-    mapped, reference = over_vehicles(FUNCTIONS[name]), jax.vmap(FUNCTIONS[name])
-    assert_alike(jax.jit(jax.grad(partial(total, mapped)))(x3), jax.grad(partial(total, reference))(x3))
-    tangent = numbers(3, seed=9)
-    assert_alike(jax.jvp(mapped, (x3,), (tangent,)), jax.jvp(reference, (x3,), (tangent,)))
+    def derivatives(mapped):
+        return jax.grad(partial(total, mapped))(x3), jax.jvp(mapped, (x3,), (numbers(3, seed=9),))
+
+    kinds = [over_vehicles(FUNCTIONS[name]), on_gpu(FUNCTIONS[name]), jax.vmap(FUNCTIONS[name])]
+    *found, expected = jax.jit(lambda: [derivatives(f) for f in kinds])()
+    for results in found:
+        assert_alike(results, expected)
 
 
 @given(st.data())
@@ -259,7 +270,7 @@ def test_branches():
         x3,
         x3[:, 0] > 0,
     )
-    shared = jax.jit(lambda on: over_vehicles(lambda x, on: nested(x, on), (0, None))(x3, on))
+    shared = jax.jit(lambda on: on_gpu(lambda x, on: nested(x, on), (0, None))(x3, on))
     assert "cond" in str(jax.make_jaxpr(shared)(True))
 
 
@@ -301,40 +312,69 @@ def test_derivatives_of_its_own():
 
     doubled.defvjp(lambda x, scale: (doubled(x, scale), scale), lambda scale, g: (5.0 * g["y"], jnp.zeros_like(scale)))
     check(lambda x: doubled(x, jnp.float32(1.0)), x3)
-    gradient = jax.grad(lambda x: jnp.sum(over_vehicles(lambda x: doubled(x, x[0])["y"])(x)))(x3)
-    assert_alike(gradient, jnp.full((N, 3), 5.0))
+    for mapped in (over_vehicles, on_gpu):
+        gradient = jax.grad(lambda x, f=mapped: jnp.sum(f(lambda x: doubled(x, x[0])["y"])(x)))(x3)
+        assert_alike(gradient, jnp.full((N, 3), 5.0))
 
 
-def outside(function):
-    """Function of a mission [3] of vehicles."""
-    return jax.vmap(lambda x, t: function(x, t), in_axes=(0, None))
+def towards(x, target):
+    """A few steps of a vehicle."""
+    end, path = lax.scan(lambda c, _: (c - 0.1 * (c - target) * jnp.tanh(c), jnp.linalg.norm(c)), x, None, 4)
+    return jnp.where(end[0] > 0, end, end[::-1]), path
 
 
-def test_transformations_compose():
-    def one(x, target):
-        step = lambda c, _: (c - 0.1 * (c - target) * jnp.tanh(c), jnp.linalg.norm(c))  # noqa: E731
-        end, path = lax.scan(step, x, None, 4)
-        return jnp.where(end[0] > 0, end, end[::-1]), path
+MISSIONS = jnp.stack([x3, x3 + 0.3, x3 * 2.0])
+TARGET = jnp.array([1.0, 2.0, 3.0])
 
-    missions = jnp.stack([x3, x3 + 0.3, x3 * 2.0])
-    target = jnp.array([1.0, 2.0, 3.0])
-    found, expected = (outside(f(one, in_axes=(0, None)))(missions, target) for f in (over_vehicles, jax.vmap))
-    assert_alike(found, expected)
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+@pytest.mark.parametrize("of_mission", [(True, True), (True, False), (False, True)])
+def test_missions_outside(platform, of_mission):
+    args = [
+        a if own else a[0] for a, own in zip((MISSIONS, jnp.stack([TARGET, -TARGET, TARGET])), of_mission, strict=True)
+    ]
+    axes = [0 if own else None for own in of_mission]
+    several = [jax.vmap(f(towards, (0, None)), axes) for f in (partial(over_vehicles, platform=platform), jax.vmap)]
+    assert_alike(*(jax.jit(f)(*args) for f in several))
+
+
+def test_sweeps_of_missions_outside():
+    sweep = jnp.stack([MISSIONS, -MISSIONS])
+    each = [jax.vmap(jax.vmap(f(towards, (0, None)), (0, None)), (0, None)) for f in (over_vehicles, jax.vmap)]
+    assert_alike(*(jax.jit(f)(sweep, TARGET) for f in each))
+
+
+def test_missions_outside_with_large_arrays():
+    def one(table, raster, x):
+        return table[:3] * raster[jnp.clip(x.astype(jnp.int32)[0], 0, 9), 0] + x
+
+    table, raster = numbers(100), jnp.asarray(RASTER)
+    for axes in [(0, None, 0), (None, 0, 0), (None, None, 0), (0, 0, None)]:
+        args = [jnp.stack([a, 2 * a]) if axis == 0 else a for a, axis in zip((table, raster, x3), axes, strict=True)]
+        assert_alike(*(jax.vmap(f(one, (0, None, 0)), axes)(*args) for f in (over_vehicles, jax.vmap)))
+
+
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_derivatives_outside(platform):
+    mapped = partial(over_vehicles, platform=platform)
 
     def loss(mapped, target, x):
-        body = lambda c, _: (mapped(one, in_axes=(0, None))(c, target)[0], None)  # noqa: E731
-        return jnp.sum(lax.scan(body, x, None, 3)[0] ** 2)
+        one = mapped(towards, in_axes=(0, None))
+        return jnp.sum(lax.scan(lambda c, _: (one(c, target)[0], None), x, None, 3)[0] ** 2)
 
-    both = [jax.jit(jax.grad(partial(loss, f), argnums=(0, 1))) for f in (over_vehicles, jax.vmap)]
-    assert_alike(both[0](target, x3), both[1](target, x3), rtol=1e-4)
-    curvature = [jax.jacfwd(jax.grad(partial(loss, f)))(target, x3) for f in (over_vehicles, jax.vmap)]
-    assert_alike(curvature[0], curvature[1], rtol=1e-4, atol=1e-4)
-    per_mission = [jax.vmap(jax.grad(partial(loss, f)), (None, 0))(target, missions) for f in (over_vehicles, jax.vmap)]
-    assert_alike(per_mission[0], per_mission[1], rtol=1e-4, atol=1e-4)
+    def every(f):
+        gradient = jax.grad(partial(loss, f), argnums=(0, 1))
+        curvature = jax.jacfwd(jax.grad(partial(loss, f)))(TARGET, x3)
+        of_all = jax.grad(lambda x: jnp.sum(jax.vmap(partial(loss, f), (None, 0))(TARGET, x)))(MISSIONS)
+        return gradient(TARGET, x3), curvature, jax.vmap(gradient, (None, 0))(TARGET, MISSIONS), of_all
+
+    found, expected = jax.jit(lambda: [every(f) for f in (mapped, jax.vmap)])()
+    assert_alike(found, expected, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("platform", PLATFORMS)
 @pytest.mark.parametrize("checked", [True, False])
-def test_shard_map(checked):
+def test_shard_map(checked, platform):
     mesh = jax.make_mesh((2,), ("missions",), axis_types=(AxisType.Auto,))
 
     def one(x, target, on):
@@ -343,7 +383,7 @@ def test_shard_map(checked):
         return jax.nn.softplus(x) + jnp.sort(x), jnp.arange(2.0)
 
     def missions(x, target, on):
-        return jax.vmap(lambda x: over_vehicles(one, in_axes=(0, None, None))(x, target, on))(x)
+        return jax.vmap(lambda x: over_vehicles(one, (0, None, None), platform=platform)(x, target, on))(x)
 
     spread = PartitionSpec("missions")
     specs = (spread, PartitionSpec(), PartitionSpec())
@@ -363,12 +403,12 @@ def test_effects_are_kept(capfd):
     assert capfd.readouterr().out.count("x ") == N
 
 
-def controlled(engine):
+def controlled(engine, substeps=2):
     step = make_multirotor_step(engine, 0.005)
 
     def tick(params, state, memory, setpoint, wind, ground):
         command, memory = control(params, memory, state, setpoint, 0.01)
-        for _ in range(2):
+        for _ in range(substeps):
             state = step(params, state, command, wind, ground)
         return state, memory
 
@@ -382,11 +422,8 @@ def fleet():
     state = airborne(params, height=30.0, speed=hover_speed(params))
     every = lambda tree: jax.tree.map(lambda x: jnp.broadcast_to(x, (N, *jnp.shape(x))), tree)  # noqa: E731
     params, state, memory, ground = every(params), every(state), every(control_start()), every(plane(5.0))
-    height = jnp.array([0.3, 0.5, 20.0, 30.0, 40.0])
-    state = jax.tree.map(lambda x: x, state)
-    position = state.body.position_m.at[:, 2].set(height)
-    body = type(state.body)(**{**vars(state.body), "position_m": position})
-    state = type(state)(**{**vars(state), "body": body})
+    position = state.body.position_m.at[:, 2].set(jnp.array([0.3, 0.5, 20.0, 30.0, 40.0]))
+    state = replace(state, body=replace(state.body, position_m=position))
     draw = lambda spread: jnp.asarray(rng.normal(0.0, spread, (N, 3)), jnp.float32)  # noqa: E731
     setpoint = PositionCommand(
         position_m=position + draw(2.0) - jnp.array([0.0, 0.0, 2.0]),
@@ -413,19 +450,16 @@ def test_controlled_multirotor(engine):
     np.testing.assert_allclose(ends[0].energy_j, ends[1].energy_j, rtol=1e-5)
 
 
-def test_gradient_of_a_controlled_multirotor():
-    params, state, memory, *rest = fleet()
+def test_gradient_of_a_multirotor():
+    params, state, _, _, wind, ground = fleet()
+    step = make_multirotor_step("analytic", 0.005)
+    speeds = jnp.full((N, 4), hover_speed(params_of()))
 
-    def loss(layout, position, mass):
-        body = type(state.body)(**{**vars(state.body), "position_m": position})
-        start = type(state)(**{**vars(state), "body": body})
-        swept = type(params)(**{**vars(params), "mass_kg": mass})
-        tick = over_vehicles(controlled("analytic"), layout=layout)
-        after = lax.scan(lambda c, _: (tick(swept, *c, *rest), None), (start, memory), None, 10)[0][0]
-        return jnp.sum(after.body.position_m**2) + jnp.sum(after.body.quaternion[:, 1])
+    def loss(mapped, position, mass):
+        before = replace(state, body=replace(state.body, position_m=position))
+        after = mapped(step)(replace(params, mass_kg=mass), before, speeds, wind, ground)
+        return jnp.sum(after.body.position_m**2) + jnp.sum(after.body.velocity_m_s[:, 2]) + jnp.sum(after.energy_j)
 
     args = state.body.position_m, params.mass_kg
-    found, expected = (
-        jax.jit(jax.grad(partial(loss, layout), argnums=(0, 1)))(*args) for layout in ("scalars", "vmap")
-    )
+    found, expected = (jax.jit(jax.grad(partial(loss, f), argnums=(0, 1)))(*args) for f in (on_gpu, jax.vmap))
     assert_alike(found, expected, rtol=1e-4, atol=1e-4)

@@ -9,7 +9,19 @@ from pydantic import ValidationError
 
 from swarmsim.config.vehicles import BodyFile, SkidSteer
 from swarmsim.vehicles.rover_body import rover_body
-from swarmsim.vehicles.skid_steer import WHEELS, effective_track, skid_steer_mjcf, skid_steer_params, turning_force
+from swarmsim.vehicles.skid_steer import (
+    FRICTION_RATIO,
+    IMPEDANCE,
+    SLIP_DAMPING_1_S,
+    WHEELS,
+    effective_track,
+    skid_steer_mjcf,
+    skid_steer_params,
+    turning_force,
+    tyre_creep,
+    tyre_sinkage,
+    wheel_inverse_mass,
+)
 from tests.physics.rovers import FILE, PARAMS, SPEC
 from tests.vehicles.skid_steer_files import ROVER
 
@@ -39,6 +51,15 @@ def test_turning_force_and_track_balance_moments_and_power():
     assert 0.5 * track * force[0] + 0.5 * base * force[1] == pytest.approx(0.0, abs=1e-12)
     assert float(turning_force(PARAMS, 1.0)) == pytest.approx(force[0], rel=1e-5)
     assert float(effective_track(PARAMS.wheel_position_m)) == pytest.approx(track + base**2 / track, rel=1e-6)
+
+
+def test_sinkage_and_creep_are_those_of_the_specification():
+    load = 0.25 * SPEC.mass_kg * 9.81
+    assert float(tyre_sinkage(PARAMS)) == pytest.approx(load / SPEC.wheels.stiffness_n_m, rel=1e-5)
+    damping = (
+        FRICTION_RATIO * SLIP_DAMPING_1_S * IMPEDANCE / (1 - IMPEDANCE) / wheel_inverse_mass(SPEC, rover_body(SPEC))
+    )
+    assert float(tyre_creep(PARAMS)) == pytest.approx(SPEC.wheels.friction * load / damping, rel=1e-5)
 
 
 def test_a_rover_from_a_urdf_takes_its_body_from_there(tmp_path):
