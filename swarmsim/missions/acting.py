@@ -139,7 +139,8 @@ def _call(
         view = _rows_of_view(seen[place.group], place.local)
         mine = rows(memory, place.rank)
         keys = phase_keys(world, phase, place, mission.world.key, mission.world.clock.tick)
-        after, command = over_vehicles(policy.act, in_axes=(TASK_AXES, 0, VIEW_AXES, 0))(task, mine, view, keys)
+        act = over_vehicles(policy.act, in_axes=(TASK_AXES, 0, VIEW_AXES, 0), layout=world.layout)
+        after, command = act(task, mine, view, keys)
         inside = rows(mission.phase_of[place.group], place.local) == number
         kept = jax.tree.map(partial(_where, inside), after, mine)
         memory = _set_rows(memory, place.rank, kept)

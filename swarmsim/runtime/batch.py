@@ -15,10 +15,21 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from swarmsim.runtime.clock import Clock
-from swarmsim.runtime.programs import Program
+from swarmsim.runtime.programs import Program, prepare
+from swarmsim.runtime.scalars import Layout
 
 SMALL = 4096  # elements up to which an array carries the mission axis whether or not missions differ in it
+MANY_VEHICLES = 1024  # of all missions on a device
 TOGETHER = 256  # missions that an accelerator estimates in step; a processor core takes one, which fits its cache
+
+
+def layout_for(vehicles: int) -> Layout:
+    """How ``vehicles`` of all missions are laid out: as scalars on an accelerator, and on a CPU where they are many.
+
+    As scalars a step is fused into few kernels, but where vehicles are few a CPU spends its time on calling them: one
+    rover steps 40 times as fast by `jax.vmap`, a thousand multirotors 1.5 to 3.5 times as fast as scalars.
+    """
+    return "vmap" if jax.default_backend() == "cpu" and vehicles < MANY_VEHICLES else "scalars"
 
 
 def shards_of(missions: int) -> int:
@@ -94,6 +105,17 @@ class Batch:
         Returns:
             Its result with the mission axis on every leaf.
         """
+        program, arguments = self._call(name, function, inputs, carried, common, only, in_turn)
+        return program(*arguments)
+
+    def prepare(self, calls: Sequence[dict[str, Any]]) -> None:
+        """Load or compile the programs of future calls of `run` (its arguments by name), several at a time."""
+        prepare([self._call(**({"common": (), "only": None, "in_turn": False} | call)) for call in calls])
+
+    def _call(
+        self, name: str, function: Callable[..., Any], inputs: Any, carried: Any, common: Any, only: Any, in_turn: bool
+    ) -> tuple[Program, tuple[Any, Any]]:
+        """The program and its arguments."""
         shape = (name, tuple((s.structure, s.carries) for s in inputs), only is not None, in_turn)
         program = self._programs.get(shape)
         if program is None:
@@ -102,7 +124,7 @@ class Batch:
             whole = self._sharded(partial(batched, apply))
             program = self._programs[shape] = Program(name, whole, clock=self._clock)
         own = [s.own for s in inputs], carried, only
-        return program(own, ([s.shared for s in inputs], tuple(common)))
+        return program, (own, ([s.shared for s in inputs], tuple(common)))
 
     def _sharded(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """The function of equal parts of the missions, on the devices side by side; parts do not wait for another."""

@@ -150,7 +150,8 @@ def _filling(dtype: Any, given: Any) -> np.generic:
             given = bounds.min if dtype.kind == "i" else bounds.max
         else:
             given = True if dtype.kind == "b" else np.nan
-    return np.asarray(given, dtype)[()]
+    filling: np.generic = np.dtype(dtype).type(given)
+    return filling
 
 
 def _full_start(

@@ -121,7 +121,6 @@ MAX, MIN = _binary("max", lax.max), _binary("min", lax.min)
 AND, OR, XOR = _binary("and", lax.bitwise_and), _binary("or", lax.bitwise_or), _binary("xor", lax.bitwise_xor)
 EQ, NE, GT, LT = _binary("eq", lax.eq), _binary("ne", lax.ne), _binary("gt", lax.gt), _binary("lt", lax.lt)
 LE, GE = _binary("le", lax.le), _binary("ge", lax.ge)
-NOT = Operation("not", lax.bitwise_not, "not", np.invert)
 
 
 # Rearrangements: numpy's own on numbers and objects alike.

@@ -18,9 +18,9 @@ from swarmsim.missions.plan import Plan
 from swarmsim.missions.plan_build import build_plan, listens
 from swarmsim.missions.segment import segment
 from swarmsim.missions.state import Log, MissionState, Signals
-from swarmsim.runtime.batch import Batch, Spread, filled
+from swarmsim.runtime.batch import Batch, Spread, filled, layout_for
 from swarmsim.runtime.clock import Clock
-from swarmsim.runtime.programs import prepare
+from swarmsim.runtime.scalars import Layout
 from swarmsim.runtime.progress import Progress, SilentProgress
 from swarmsim.site import SiteModel
 from swarmsim.world import randomness
@@ -100,7 +100,8 @@ class Simulation:
         padded = filled(numbers)
         batch = self._batches.setdefault(len(padded), Batch(len(padded), self.clock))
         self.clock.reset()
-        worlds, plans = self._spread(batch, values or {}, len(numbers))
+        layout = layout_for(self.world.vehicles * batch.missions // batch.shards)
+        worlds, plans = self._spread(batch, values or {}, len(numbers), layout)
         run = _Run(batch, worlds, plans, self.plan, tell)
         keys = batch.put(randomness.mission_keys(padded))
         end, segments = run.fly(keys)
@@ -114,10 +115,12 @@ class Simulation:
             clock=self.clock.copy(),
         )
 
-    def _spread(self, batch: Batch, values: Mapping[str, Sequence[Any]], missions: int) -> tuple[Spread, Spread]:
+    def _spread(
+        self, batch: Batch, values: Mapping[str, Sequence[Any]], missions: int, layout: Layout
+    ) -> tuple[Spread, Spread]:
         """World and plan of every mission."""
         if not values:
-            return batch.spread([self.world]), batch.spread([self.plan])
+            return batch.spread([replace(self.world, layout=layout)]), batch.spread([self.plan])
         for path, each in values.items():
             if len(each) != missions:
                 raise InputError.of(
@@ -132,7 +135,8 @@ class Simulation:
                 built[key] = _built(scenario, self.site_model)
                 self._check_alike(built[key], values)
             pairs.append(built[key])
-        return batch.spread([world for world, _ in pairs]), batch.spread([plan for _, plan in pairs])
+        worlds = [replace(world, layout=layout) for world, _ in pairs]
+        return batch.spread(worlds), batch.spread([plan for _, plan in pairs])
 
     def _check_alike(self, built: tuple[World, Plan], values: Mapping[str, Any]) -> None:
         """Refuse what would need another program: other sizes, or other static choices."""
@@ -164,7 +168,9 @@ class _Run:
     def fly(self, keys: Any) -> tuple[MissionState, list[Segment]]:
         """All missions to their end, a decision period at a time."""
         batch, names = self._batch, [phase.name for phase in self._plan.phases]
+        self._tell.phase("compile", 0.0)
         mission, signals = batch.run("reset", _begin_mission, self._inputs, keys)
+        self._prepare(keys, mission)
         world = self._first_world()
         timing, tick = world.timing, 0
         segments: list[Segment] = []
@@ -174,15 +180,10 @@ class _Run:
         while True:
             for number in np.flatnonzero(begin.any(axis=0)):
                 self._tell.phase(f"plan {names[number]}", 0.0)
-                mission = batch.run(
-                    f"begin {names[number]}", partial(_begin_phase, int(number)), self._inputs, mission,
-                    (np.int32(tick),), only=batch.put(begin[:, number]),
-                )  # fmt: skip
+                mission = batch.run(**self._beginning(int(number), mission, tick, begin[:, number]))
                 told = ()
             running = self._running(mission) if begin.any() else active.any(axis=0)
-            mission, log, signals = batch.run(
-                "run", _segment, self._inputs, mission, (np.int32(tick), np.asarray(running))
-            )
+            mission, log, signals = batch.run(**self._advance(mission, tick, running))
             tick += timing.decision_ticks
             segments.append(Segment(log=_kept(log, running), running=running))
             begin, active = np.asarray(signals.begin), np.asarray(signals.active)
@@ -195,6 +196,39 @@ class _Run:
                 self._tell.advance(seconds, tick, max(tick, int(horizon / timing.control_period_s)))
             if bool(np.asarray(signals.over).all()):
                 return mission, segments
+
+    def _beginning(self, number: int, mission: MissionState, tick: int, begin: np.ndarray) -> dict[str, Any]:
+        """The call that begins a phase in the missions ``begin`` [B]."""
+        return {
+            "name": f"begin {self._plan.phases[number].name}",
+            "function": partial(_begin_phase, number),
+            "inputs": self._inputs,
+            "carried": mission,
+            "common": (np.int32(tick),),
+            "only": self._batch.put(begin),
+        }
+
+    def _advance(self, mission: MissionState, tick: int, running: np.ndarray) -> dict[str, Any]:
+        """The call that runs a segment."""
+        common = (np.int32(tick), np.asarray(running, bool))
+        return {
+            "name": "run", "function": _segment, "inputs": self._inputs, "carried": mission, "common": common
+        }  # fmt: skip
+
+    def _conclusion(self, mission: MissionState, keys: Any) -> dict[str, Any]:
+        """The call that concludes the missions."""
+        carried = (keys, mission)
+        return {
+            "name": "conclude", "function": _conclude, "inputs": self._inputs, "carried": carried, "in_turn": True
+        }  # fmt: skip
+
+    def _prepare(self, keys: Any, mission: MissionState) -> None:
+        """Load or compile all programs of the mission, side by side."""
+        nobody, groups = np.zeros(self._batch.missions, bool), len(mission.world.groups)
+        calls = [self._advance(mission, 0, np.ones(groups, bool))]
+        calls += [self._conclusion(mission, keys)] if self._estimates else []
+        calls += [self._beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
+        self._batch.prepare(calls)
 
     def _first_world(self) -> World:
         structure = self._inputs[0].structure
@@ -209,7 +243,7 @@ class _Run:
         if not self._estimates:
             return None
         self._tell.phase("estimate and identify", 0.0)
-        return self._batch.run("conclude", _conclude, self._inputs, (keys, mission), in_turn=True)
+        return self._batch.run(**self._conclusion(mission, keys))
 
 
 def _with_clock(mission: MissionState, tick: jax.Array, running: jax.Array) -> MissionState:
@@ -252,4 +286,4 @@ def _kept(log: Log, running: np.ndarray) -> Log:
     return replace(log, tracks=tracks, samples=samples)  # type: ignore[arg-type]
 
 
-__all__ = ["MissionBatch", "Segment", "Simulation", "prepare"]
+__all__ = ["MissionBatch", "Segment", "Simulation"]

@@ -112,12 +112,14 @@ def count(
         tick, control_period_s: the time.
     """
     state = replace(state, reading=replace(state.reading, fresh=jnp.zeros_like(state.reading.fresh)))
+    # Across the branches go the key's bits: JAX (0.10.1) cannot take the gradient of a scan whose `cond` keeps a key.
+    bits, impl = jax.random.key_data(key), jax.random.key_impl(key)
 
     def evaluate(state: CounterState) -> CounterState:
         return _evaluated(counter, state, body, active, site, sources)
 
     def finish(state: CounterState) -> CounterState:
-        return _read_out(counter, state, member, key, tick, control_period_s)
+        return _read_out(counter, state, member, jax.random.wrap_key_data(bits, impl=impl), tick, control_period_s)
 
     state = jax.lax.cond(tick % counter.ticks == 0, evaluate, lambda s: s, state)
     return jax.lax.cond(tick % (counter.ticks * counter.evaluations) == 0, finish, lambda s: s, state)

@@ -170,7 +170,7 @@ def _advance_group(
         return _Moved(vehicle=kept[0], control=kept[1], impact_m_s=impact, finite=state.finite & finite)
 
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
-    moved = over_vehicles(one, in_axes=(0, 0, 0, None), unroll=1)(group.params, seen, command, world.site)
+    moved = over_vehicles(one, in_axes=(0, 0, 0, None), layout=world.layout, unroll=1)(group.params, seen, command, world.site)
     after = replace(
         before, vehicle=moved.vehicle, control=moved.control, impact_m_s=moved.impact_m_s, finite=moved.finite
     )
