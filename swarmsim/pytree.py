@@ -4,8 +4,17 @@ import dataclasses
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 
 T = TypeVar("T")
+
+
+def on_host(value: Any, dtype: Any = np.float32) -> Any:
+    """A leaf made on the host: a numpy array, which compiled functions take as they take one of JAX.
+
+    Building with `jax.numpy` would compile a small program for each operation.
+    """
+    return np.asarray(value, dtype)
 
 
 def static(**kwargs: Any) -> Any:

@@ -9,7 +9,6 @@ import pytest
 import yaml
 
 import swarmsim
-
 from swarmsim.config.files import packaged_dir
 from swarmsim.config.load import load_named
 from swarmsim.config.scenario import load_scenario

@@ -138,7 +138,7 @@ def multirotor_command(command: object, rotors: int) -> MultirotorCommand:
     Raises TypeError for anything that does not command a multirotor, and for a wrong shape.
     """
     zero3 = jnp.zeros(3)
-    level = {PositionCommand: POSITION, AttitudeCommand: ATTITUDE, BodyRateCommand: BODY_RATE}
+    level: dict[type, int] = {PositionCommand: POSITION, AttitudeCommand: ATTITUDE, BodyRateCommand: BODY_RATE}
     whole = MultirotorCommand(
         level=jnp.int32(level.get(type(command), ROTOR_SPEED)),
         position_m=zero3,
@@ -159,7 +159,7 @@ def skid_steer_command(command: object) -> SkidSteerCommand:
 
     Raises TypeError for anything that does not command a skid-steer rover, and for a wrong shape.
     """
-    level = {DriveToCommand: DRIVE_TO, DriveCommand: DRIVE}
+    level: dict[type, int] = {DriveToCommand: DRIVE_TO, DriveCommand: DRIVE}
     whole = SkidSteerCommand(
         level=jnp.int32(level.get(type(command), WHEEL_SPEED)),
         position_m=jnp.zeros(2),

@@ -1,6 +1,7 @@
 """Cascaded control of a multirotor: position, velocity, attitude, body rate, rotor thrusts.
 
-A command may enter at any of the four levels of `swarmsim.control.commands`. The structure is that of PX4 and of Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control", IEEE
+A command may enter at any of the four levels of `swarmsim.control.commands`. The structure is that of PX4 and of
+Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control", IEEE
 Transactions on Control Systems Technology 28(2), 2020: the tilt, which carries the thrust, comes before the yaw.
 World ENU, body FLU, SI units; one vehicle. Run it every 10 ms.
 """

@@ -74,12 +74,18 @@ def views(world: World, plan: Plan, state: WorldState, belief: Any) -> tuple[Vie
     return tuple(made)
 
 
-VIEW_AXES = View(
-    time_s=None, position_m=0, quaternion=0, velocity_m_s=0, angular_velocity_rad_s=0, battery=0, height_m=0, hold=0,
-    push_m=0, nearest_m=0, reading=0, heard=0, belief=None,
-)  # type: ignore[arg-type]  # fmt: skip
-"""Which parts of a group's view are each vehicle's own: integers stand where the arrays are."""
-TASK_AXES = Task(settings=None, site=None, home_m=0, yaw_rad=0, params=0, rank=0, path=0)  # type: ignore[arg-type]
+_SHARED = ("time_s", "belief", "settings", "site")  # of a view or a task: the same for all vehicles of a group
+
+
+def _axes(cls: Any) -> Any:
+    """The axes of a view or a task, in its own shape: integers stand where the arrays are."""
+    return cls(**{name: None if name in _SHARED else 0 for name in cls.__dataclass_fields__})
+
+
+VIEW_AXES = _axes(View)
+"""Which parts of a group's view are each vehicle's own."""
+TASK_AXES = _axes(Task)
+"""Which parts of a phase's tasks are each vehicle's own."""
 
 
 def tasks(world: World, plan: Plan, phase: Phase, place: Place, path: Any) -> Task:
@@ -116,9 +122,7 @@ def act(
             memory, commands = call(state)
         else:
             held = state.held
-            memory, commands = jax.lax.cond(
-                tick % period == 0, call, lambda s, held=held: (s.memory, held), state
-            )
+            memory, commands = jax.lax.cond(tick % period == 0, call, lambda s, held=held: (s.memory, held), state)
             state = replace(state, held=commands)
         phases.append(replace(state, memory=memory))
         for place, command in zip(phase.places, commands, strict=True):

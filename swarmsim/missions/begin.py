@@ -83,7 +83,7 @@ def _idle(world: World, plan: Plan, phase: Phase, mission: MissionState, seen: A
 
 def _memory(world: World, plan: Plan, phase: Phase, mission: MissionState, path: Path | None) -> Any:
     """Memories [M] at the beginning of the phase."""
-    policy, parts, ranks = policy_of(world, phase), [], []
+    policy, parts, ranks = policy_of(world, phase), [], list[int]()
     for place in phase.places:
         task = tasks(world, plan, phase, place, path)
         keys = phase_keys(world, phase, place, mission.world.key, mission.world.clock.tick)
@@ -138,9 +138,7 @@ def begin_phase(world: World, plan: Plan, mission: MissionState, number: int) ->
     return replace(mission, phases=phases)
 
 
-def _situation(
-    world: World, phase: Phase, mission: MissionState, target_m: jax.Array, found: jax.Array
-) -> Situation:
+def _situation(world: World, phase: Phase, mission: MissionState, target_m: jax.Array, found: jax.Array) -> Situation:
     """Where the phase's vehicles are, in their order."""
     position = jnp.zeros((phase.size, 3))
     for place in phase.places:
@@ -149,15 +147,14 @@ def _situation(
     return Situation(position_m=position, target_m=target_m, found=found)
 
 
-def _target(
-    world: World, plan: Plan, phase: Phase, mission: MissionState
-) -> tuple[MissionState, jax.Array, jax.Array]:
+def _target(world: World, plan: Plan, phase: Phase, mission: MissionState) -> tuple[MissionState, jax.Array, jax.Array]:
     """The mission with what was learned for it, the place [2] that the phase goes to, and whether [] there is one."""
     if phase.target == "source":
         learned = knowledge.survey(plan, knowledge.gathered(world, mission.windows))
         return replace(mission, survey=learned), learned.fit.position_m[:2], learned.found
     if phase.target == "hotspot":
         assert plan.mapping is not None
+        assert mission.belief is not None
         chart = recursive_map.read(plan.mapping, mission.belief)
         hotspots = extract_hotspots(plan.mapping, chart)
         return mission, hotspots.position_m[0], hotspots.valid[0]

@@ -18,9 +18,9 @@ from swarmsim.estimation.windows import Windows, measured
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey
 from swarmsim.pytree import pytree
+from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.rate import spectrum_rate
-from swarmsim.radiation.detector import Detector, Source
 from swarmsim.site import Site, path_lengths
 from swarmsim.world import randomness
 from swarmsim.world.model import World

@@ -7,12 +7,14 @@ import numpy as np
 
 from swarmsim.config.mission import Phase as PhaseSpec
 from swarmsim.config.mission import Trigger as TriggerSpec
+from swarmsim.config.policies import ParallelLines
 from swarmsim.config.scenario import Scenario
 from swarmsim.estimation import localisation_params, mapping_params
 from swarmsim.estimation.recursive_map import default_bin_cells
 from swarmsim.missions.plan import Phase, Place, Plan, PolicyReference, Trigger, Values
 from swarmsim.policies import registry
 from swarmsim.policies.protocol import Assignment
+from swarmsim.pytree import on_host
 from swarmsim.site import SiteModel
 from swarmsim.world.build import detector_models, grouped, library_of
 from swarmsim.world.kinds import KINDS
@@ -47,9 +49,9 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
         detectors=detectors,
         mapping=mapping,
         localisation=None if localisation is None or not detectors else localisation_params(localisation),
-        presumed_nuclide=np.int32(nuclide),
-        spectrum_radius_m=np.float32(0.0 if identification is None else identification.spectrum_radius_m),
-        confidence_min=np.float32(1.0 if identification is None else identification.confidence_min),
+        presumed_nuclide=on_host(nuclide, np.int32),
+        spectrum_radius_m=on_host(0.0 if identification is None else identification.spectrum_radius_m),
+        confidence_min=on_host(1.0 if identification is None else identification.confidence_min),
         phases=tuple(_phase(scenario, site_model, i) for i in range(len(mission.phases))),
         per_window=per_window,
         windows=windows,
@@ -61,8 +63,9 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
 
 def _surveyed(scenario: Scenario, site_model: SiteModel) -> np.ndarray:
     """Corners [V, 2] of what the map covers: the areas that phases survey, or the site's survey area."""
-    areas = [np.array(s.area_m) for s in scenario.settings if getattr(s, "area_m", None) is not None]
-    whole = any(hasattr(s, "area_m") and s.area_m is None for s in scenario.settings)
+    surveys = [s for s in scenario.settings if isinstance(s, ParallelLines)]
+    areas = [np.array(s.area_m) for s in surveys if s.area_m is not None]
+    whole = any(s.area_m is None for s in surveys)
     if areas and not whole:
         return np.concatenate(areas)
     return np.concatenate([np.asarray(site_model.site.survey_area_m), *areas])
@@ -114,12 +117,12 @@ def _phase(scenario: Scenario, site_model: SiteModel, number: int) -> Phase:
     return Phase(
         task=task,
         settings=Values.of(settings),
-        target_m=np.asarray(target if kind == "point" else (0.0, 0.0), np.float32),
-        start_s=np.float32(_seconds(spec.start)),
-        end_s=np.float32(0.0 if spec.end is None else _seconds(spec.end)),
-        time_limit_s=np.float32(spec.time_limit_s),
-        home_m=np.asarray([m.position_m for m in team], np.float32),
-        yaw_rad=np.radians([m.heading_deg for m in team]).astype(np.float32),
+        target_m=on_host(target if kind == "point" else (0.0, 0.0)),
+        start_s=on_host(_seconds(spec.start)),
+        end_s=on_host(0.0 if spec.end is None else _seconds(spec.end)),
+        time_limit_s=on_host(spec.time_limit_s),
+        home_m=on_host([m.position_m for m in team]),
+        yaw_rad=on_host(np.radians([m.heading_deg for m in team])),
         name=spec.name,
         policy=policy,
         places=_places(scenario, members),

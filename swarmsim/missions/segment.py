@@ -89,7 +89,7 @@ def _poses(mission: MissionState) -> tuple[Track, ...]:
 
 def _samples(mission: MissionState, after_s: jax.Array) -> tuple[Sampled | None, ...]:
     """Exposures that ended after ``after_s`` []."""
-    found = []
+    found: list[Sampled | None] = []
     for g in mission.world.groups:
         if g.counter is None:
             found.append(None)
@@ -112,7 +112,6 @@ def _samples(mission: MissionState, after_s: jax.Array) -> tuple[Sampled | None,
 def _learned(world: World, plan: Plan, mission: MissionState, samples: tuple[Sampled | None, ...]) -> MissionState:
     """The mission with the segment's counts in its windows and in the team's belief."""
     windows, belief = list(mission.windows), mission.belief
-    reference = plan.detectors[0].background_cps if plan.detectors else None
     for number, (group, sampled) in enumerate(zip(world.groups, samples, strict=True)):
         if sampled is None or group.counter is None:
             continue
@@ -120,7 +119,7 @@ def _learned(world: World, plan: Plan, mission: MissionState, samples: tuple[Sam
         if held is not None:
             windows[number] = gather(held, _measurements(sampled), sampled.new, plan.per_window[number])
         if belief is not None and plan.mapping is not None:
-            own = plan.detectors[group.counter.index].background_cps
+            reference, own = (plan.detectors[k].background_cps for k in (0, group.counter.index))
             size = jnp.where(reference > 0.0, own / jnp.maximum(reference, 1e-9), 1.0)
             flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sampled)
             belief = recursive_map.update(

@@ -6,11 +6,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from swarmsim.config.vehicles import Multirotor
 from swarmsim.policies.path import Path, limit_speed, resample
-from swarmsim.pytree import pytree
+from swarmsim.pytree import on_host, pytree
 from swarmsim.site import Site, sample
 
 PATH_SPACING_M = 0.5  # between points of a path, at most
@@ -45,7 +44,7 @@ def flight_profile(settings: Any, specs: Sequence[Any]) -> FlightProfile:
         )
     }  # fmt: skip
     numbers["acceleration_m_s2"] = 0.5 * min(limits)
-    return FlightProfile(**{name: np.float32(number) for name, number in numbers.items()})
+    return FlightProfile(**{name: on_host(number) for name, number in numbers.items()})
 
 
 def points_for(length_m: float, altitude_m: float) -> int:
@@ -85,9 +84,7 @@ def safe_height(profile: FlightProfile, site: Site, xy: jax.Array, spacing: jax.
     offsets = jnp.stack([jnp.cos(ring), jnp.sin(ring)], axis=-1)
     around = xy[:, None, None] + jnp.array([0.0, 0.5, 1.0])[:, None, None] * profile.obstacle_clearance_m * offsets
     surface = jnp.max(sample(site.surface_m, site, around), axis=(1, 2))
-    wanted = jnp.maximum(
-        sample(site.terrain_m, site, xy) + profile.altitude_m, surface + profile.obstacle_clearance_m
-    )
+    wanted = jnp.maximum(sample(site.terrain_m, site, xy) + profile.altitude_m, surface + profile.obstacle_clearance_m)
     slope = CLIMB_GRADIENT * spacing * jnp.arange(len(wanted))
     ahead = jax.lax.cummax(wanted - slope, reverse=True) + slope
     behind = jax.lax.cummax(wanted + slope) - slope

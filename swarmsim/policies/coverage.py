@@ -15,7 +15,7 @@ from swarmsim.policies.air_path import FlightProfile, air_path, flight_profile, 
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
-from swarmsim.pytree import pytree, static
+from swarmsim.pytree import on_host, pytree, static
 from swarmsim.site import Site
 
 
@@ -42,15 +42,20 @@ def lines_needed(area_m: np.ndarray, line_spacing_m: float, sweep_rad: float) ->
 def bands_needed(area_m: np.ndarray, lines: int, vehicles: int, sweep_rad: float) -> int:
     """Into how many pieces lines are cut: one, unless there are too few lines for so many vehicles (host).
 
-    Then it divides the vehicles, so that nobody's part lies in two bands, and parts are as square as that allows.
+    Then it divides the vehicles, so that nobody's part lies in two bands, and parts are as square as that allows. The
+    vehicles of a band get equal numbers of pieces, or at least two each, so that parts differ by no more than a half.
     """
     if lines >= 2 * vehicles:
         return 1
     along = np.array([math.cos(sweep_rad), math.sin(sweep_rad)])
     across = np.array([-along[1], along[0]])
     square = math.sqrt(vehicles * np.ptp(area_m @ along) / np.ptp(area_m @ across))
-    enough = [n for n in range(1, vehicles + 1) if vehicles % n == 0 and lines * n >= vehicles]
-    return min(enough, key=lambda n: abs(math.log(n / square)))
+
+    def balanced(share: int) -> bool:
+        return lines % share == 0 or lines >= 2 * share
+
+    fair = [n for n in range(1, vehicles + 1) if vehicles % n == 0 and balanced(vehicles // n)]
+    return min(fair, key=lambda n: abs(math.log(n / square)))
 
 
 @register("parallel_lines")
@@ -74,10 +79,10 @@ class ParallelLinesPlanner:
         piece = float(np.linalg.norm(np.ptp(area, axis=0))) / bands
         return SurveyTask(
             profile=flight_profile(settings, [scenario.vehicles[i] for i in assignment.members]),
-            area_m=np.asarray(area, np.float32),
-            home_m=np.asarray(homes, np.float32),
-            line_spacing_m=np.float32(spacing),
-            sweep_rad=np.float32(sweep),
+            area_m=on_host(area),
+            home_m=on_host(homes),
+            line_spacing_m=on_host(spacing),
+            sweep_rad=on_host(sweep),
             lines_max=lines,
             bands=bands,
             points=points_for(share * (piece + spacing) + 3 * extent, settings.altitude_m),
@@ -124,17 +129,15 @@ def _cut_lines(task: SurveyTask) -> tuple[jax.Array, jax.Array, jax.Array]:
     return low[:, None] * along + offset, high[:, None] * along + offset, used
 
 
-def _pieces(
-    start: jax.Array, end: jax.Array, used: jax.Array, bands: int
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Lines [L, 2] cut into ``bands`` equal pieces [bands L, 2] each: the first pieces of all lines, then the second."""
+def _pieces(start: jax.Array, end: jax.Array, used: jax.Array, bands: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Lines [L, 2] cut into ``bands`` equal pieces [bands L, 2] each: the first pieces of all, then the second ones."""
     edge = jnp.linspace(0.0, 1.0, bands + 1)[:, None, None]
     cut = start + edge * (end - start)
     return cut[:-1].reshape(-1, 2), cut[1:].reshape(-1, 2), jnp.tile(used, bands)
 
 
 def _places_in_order(task: SurveyTask, position_m: jax.Array) -> jax.Array:
-    """Rank [M] of vehicles at ``position_m`` [M, 2] in the order of the parts: along the lines by bands, then across."""
+    """Rank [M] of vehicles at ``position_m`` [M, 2] in the order of the parts: by bands, then across the lines."""
     along = jnp.array([jnp.cos(task.sweep_rad), jnp.sin(task.sweep_rad)])
     across = jnp.array([-along[1], along[0]])
     count = position_m.shape[0]

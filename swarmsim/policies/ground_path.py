@@ -1,15 +1,16 @@
 """Paths of rovers: routes over the traversability cost of a site, rounded and given speeds."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from swarmsim.config.vehicles import SkidSteer
 from swarmsim.policies.path import Path, limit_speed, resample
 from swarmsim.policies.protocol import Assignment
 from swarmsim.policies.routes import coarsen, smooth
+from swarmsim.pytree import on_host
 from swarmsim.site import Site, sample
 
 ROUTE_CELL_M = 1.0  # routes are planned on cells of about this size
@@ -45,21 +46,19 @@ def planning_cells(site: Site) -> tuple[int, float]:
     return block, block * cell
 
 
-def rover_limits(assignment: Assignment) -> tuple[np.ndarray, np.ndarray]:
+def rover_limits(assignment: Assignment) -> tuple[Any, Any]:
     """Clearance [M] (m) that each rover needs, and the acceleration [M] of its paths (host)."""
     specs = [assignment.scenario.vehicles[i] for i in assignment.members]
     rovers = [spec for spec in specs if isinstance(spec, SkidSteer)]
     radius = [0.5 * spec.chassis_size_m[1] + ROVER_MARGIN_M for spec in rovers]
     acceleration = [0.5 * spec.control.acceleration_max_m_s2 for spec in rovers]
-    return np.asarray(radius, np.float32), np.asarray(acceleration, np.float32)
+    return on_host(radius), on_host(acceleration)
 
 
 def route_grid(site: Site, radius_m: jax.Array, block: int, start_m: jax.Array) -> RouteGrid:
     """The grid for a rover of a radius that stands at ``start_m`` [2]; its own cell is always open."""
     cost = coarsen(site.cost, site.clearance_m, radius_m, block)
-    grid = RouteGrid(
-        cost=cost, origin_m=site.origin_m + 0.5 * (block - 1) * site.cell_m, cell_m=site.cell_m * block
-    )
+    grid = RouteGrid(cost=cost, origin_m=site.origin_m + 0.5 * (block - 1) * site.cell_m, cell_m=site.cell_m * block)
     start = grid.cell_of(start_m)
     return RouteGrid(cost=cost.at[start[0], start[1]].min(START_COST), origin_m=grid.origin_m, cell_m=grid.cell_m)
 

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from swarmsim.config.policies import ApproachAndOrbit as ApproachAndOrbitSettings
 from swarmsim.policies.ground_path import ROUTE_POINTS, ground_path, planning_cells, route_grid, rover_limits
@@ -13,7 +12,7 @@ from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
 from swarmsim.policies.routes import cost_to_go, descend
-from swarmsim.pytree import pytree, static
+from swarmsim.pytree import on_host, pytree, static
 from swarmsim.site import Site
 
 ROUTE_WINDOW_M = 25.0  # a route round the target stays this close to it
@@ -50,8 +49,8 @@ class ApproachAndOrbit:
         block, cell = planning_cells(assignment.site_model.site)
         radius, acceleration = rover_limits(assignment)
         return SearchTask(
-            standoff_m=np.float32(settings.standoff_m),
-            speed_m_s=np.float32(settings.speed_m_s),
+            standoff_m=on_host(settings.standoff_m),
+            speed_m_s=on_host(settings.speed_m_s),
             acceleration_m_s2=acceleration,
             radius_m=radius,
             viewpoints=settings.viewpoints,

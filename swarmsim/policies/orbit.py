@@ -11,7 +11,7 @@ from swarmsim.policies.air_path import FlightProfile, air_path, flight_profile, 
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
-from swarmsim.pytree import pytree, static
+from swarmsim.pytree import on_host, pytree, static
 from swarmsim.site import Site
 
 CORNERS_PER_TURN = 36
@@ -46,8 +46,8 @@ class OrbitPlanner:
         length = 2.0 * across + 2.0 * math.pi * settings.radius_m * settings.turns
         return OrbitTask(
             profile=flight_profile(settings, [scenario.vehicles[i] for i in assignment.members]),
-            home_m=homes,
-            radius_m=np.float32(settings.radius_m),
+            home_m=on_host(homes),
+            radius_m=on_host(settings.radius_m),
             corners=math.ceil(CORNERS_PER_TURN * settings.turns) + 1,
             turns=settings.turns,
             points=points_for(length, settings.altitude_m),

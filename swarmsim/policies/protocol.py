@@ -21,7 +21,7 @@ class Policy(Protocol):
     """Decides for one vehicle. Optional attributes, with what holds without them:
 
     ``period_s`` between two calls of `act` (each control period) · ``vehicles``: kinds of vehicle that it can steer
-    (all) · ``Settings``: a `PolicySettings` class (no settings) · ``listens``: whether it reads ``view.heard`` (False) ·
+    (all) · ``Settings``: a `PolicySettings` class (no settings) · ``listens``: whether it reads ``view.heard`` (no) ·
     ``done(task, memory, view) -> bool []``: whether the vehicle's part in the phase is over (never).
     """
 

@@ -15,7 +15,7 @@ from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
 from swarmsim.policies.routes import cost_to_go, descend
-from swarmsim.pytree import pytree, static
+from swarmsim.pytree import on_host, pytree, static
 from swarmsim.site import Site
 
 
@@ -61,13 +61,16 @@ class WaypointsPlanner:
             length = float(np.linalg.norm(np.diff(tour, axis=0), axis=1).sum()) + 2.0 * spread
             points = points_for(length, settings.altitude_m)
             return AirWaypoints(
-                profile=flight_profile(settings, specs), home_m=homes, corners_m=corners, points=points
+                profile=flight_profile(settings, specs),
+                home_m=on_host(homes),
+                corners_m=on_host(corners),
+                points=points,
             )
         block, _ = planning_cells(assignment.site_model.site)
         radius, acceleration = rover_limits(assignment)
         return GroundWaypoints(
-            corners_m=corners,
-            speed_m_s=np.float32(settings.speed_m_s),
+            corners_m=on_host(corners),
+            speed_m_s=on_host(settings.speed_m_s),
             acceleration_m_s2=acceleration,
             radius_m=radius,
             block=block,
@@ -87,9 +90,7 @@ def _fly(task: AirWaypoints, site: Site, position: jax.Array, home: jax.Array) -
     return air_path(task.profile, site, position, home, task.corners_m, task.points)
 
 
-def _drive(
-    task: GroundWaypoints, site: Site, position: jax.Array, radius: jax.Array, acceleration: jax.Array
-) -> Path:
+def _drive(task: GroundWaypoints, site: Site, position: jax.Array, radius: jax.Array, acceleration: jax.Array) -> Path:
     grid = route_grid(site, radius, task.block, position[:2])
     steps = 2 * sum(grid.cost.shape)
 

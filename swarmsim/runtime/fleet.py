@@ -70,7 +70,7 @@ def _flight(params: MultirotorParams, vehicles: int, own_parameters: bool) -> tu
 
 
 def _fly(
-    engine: Any, layout: Layout, own_parameters: bool, ticks: int, params: Any, target_m: jax.Array, wind: Any, ground: Any
+    engine: Any, layout: Layout, own_parameters: bool, ticks: int, params: Any, target_m: Any, wind: Any, ground: Any
 ) -> jax.Array:
     """Positions [N, 3] after the flight.
 
@@ -85,7 +85,7 @@ def _fly(
         def tick(state: Any, _: None) -> tuple[Any, None]:
             vehicle, memory = state
             speeds, memory = control(params, memory, vehicle, command, SUBSTEPS * TIME_STEP_S)
-            for _ in range(SUBSTEPS):
+            for _substep in range(SUBSTEPS):
                 vehicle = step(params, vehicle, speeds, wind, ground)
             return (vehicle, memory), None
 

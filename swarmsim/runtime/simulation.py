@@ -20,8 +20,8 @@ from swarmsim.missions.segment import segment
 from swarmsim.missions.state import Log, MissionState, Signals
 from swarmsim.runtime.batch import Batch, Spread, filled, layout_for
 from swarmsim.runtime.clock import Clock
-from swarmsim.runtime.scalars import Layout
 from swarmsim.runtime.progress import Progress, SilentProgress
+from swarmsim.runtime.scalars import Layout
 from swarmsim.site import SiteModel
 from swarmsim.world import randomness
 from swarmsim.world.build import build_world
@@ -141,8 +141,9 @@ class Simulation:
     def _check_alike(self, built: tuple[World, Plan], values: Mapping[str, Any]) -> None:
         """Refuse what would need another program: other sizes, or other static choices."""
         for own, other in zip((self.world, self.plan), built, strict=True):
-            (leaves, structure), (others, other_structure) = jax.tree.flatten(own), jax.tree.flatten(other)
-            if structure != other_structure or [*map(np.shape, leaves)] != [*map(np.shape, others)]:
+            leaves, structure = jax.tree.flatten(own)
+            others, other_structure = jax.tree.flatten(other)
+            if str(structure) != str(other_structure) or [*map(np.shape, leaves)] != [*map(np.shape, others)]:
                 raise InputError.of(
                     "changes more than a value (a number of things, a policy, a period, a size): missions of one batch "
                     "must agree in those",
@@ -182,12 +183,13 @@ class _Run:
                 self._tell.phase(f"plan {names[number]}", 0.0)
                 mission = batch.run(**self._beginning(int(number), mission, tick, begin[:, number]))
                 told = ()
-            running = self._running(mission) if begin.any() else active.any(axis=0)
+            running = self._running(mission) if begin.any() else np.asarray(active.any(axis=0))
             mission, log, signals = batch.run(**self._advance(mission, tick, running))
             tick += timing.decision_ticks
             segments.append(Segment(log=_kept(log, running), running=running))
             begin, active = np.asarray(signals.begin), np.asarray(signals.active)
-            under_way = tuple(n for n, r in zip(names, np.asarray(signals.running).any(axis=0), strict=True) if r)
+            running_phases = np.flatnonzero(np.asarray(signals.running).any(axis=0))
+            under_way = tuple(names[number] for number in running_phases)
             if under_way and under_way != told:
                 self._tell.phase(" + ".join(under_way), horizon)
                 told = under_way

@@ -61,7 +61,14 @@ def counter_start(vehicles: int) -> CounterState:
     """State of counters that have measured nothing yet."""
     zero, vectors, no = jnp.zeros(vehicles), jnp.zeros((vehicles, 3)), jnp.zeros(vehicles, bool)
     reading = Reading(
-        time_s=zero, position_m=vectors, travel_m=vectors, axis=vectors, counts=zero, exposure_s=zero, valid=no, fresh=no
+        time_s=zero,
+        position_m=vectors,
+        travel_m=vectors,
+        axis=vectors,
+        counts=zero,
+        exposure_s=zero,
+        valid=no,
+        fresh=no,
     )
     none = jnp.zeros(vehicles, jnp.int32)
     return CounterState(

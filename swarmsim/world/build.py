@@ -13,6 +13,7 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.physics.multirotor import check_time_step
+from swarmsim.pytree import on_host
 from swarmsim.radiation.detector import Detector, Source, build_detector
 from swarmsim.radiation.library import Library
 from swarmsim.sensors.radiation import Counter
@@ -138,7 +139,7 @@ def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library
         counter=_counter(scenario, specs, timing, library),
         start_m=_f32([m.position_m for m in team]),
         yaw_rad=_f32(np.radians([m.heading_deg for m in team])),
-        member=np.asarray(members, np.int32),
+        member=on_host(members, np.int32),
         kind=specs[0].kind,
     )
 
@@ -208,5 +209,5 @@ def _sources(scenario: Scenario, site_model: SiteModel, library: Library) -> Sou
     return Source(
         position_m=_f32(np.concatenate([xy, height[:, None]], axis=1)),
         activity_bq=_f32([1e6 * s.activity_mbq for s in truths] or [0.0]),
-        nuclide=np.array([library.nuclide_index(s.nuclide) for s in truths] or [0], np.int32),
+        nuclide=on_host([library.nuclide_index(s.nuclide) for s in truths] or [0], np.int32),
     )

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 KINDS = ("crash", "obstacle", "vehicle", "battery_empty", "non_finite")
-"""crash: hit the ground too hard or tipped over · obstacle, vehicle: collided with one · battery_empty · non_finite: its
-state stopped being a number and is held at the last good one."""
+"""crash: hit the ground too hard or tipped over · obstacle, vehicle: collided with one · battery_empty · non_finite:
+its state stopped being a number and is held at the last good one."""
 
 CRASH, OBSTACLE, VEHICLE, BATTERY_EMPTY, NON_FINITE = range(len(KINDS))
 DESCRIPTIONS = {

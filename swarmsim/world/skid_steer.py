@@ -53,7 +53,7 @@ def tick(
     dt: float,
     substeps: int,
 ) -> tuple[SkidSteerState, tuple[()], jax.Array]:
-    """Vehicle, controller and the speed [] at which it met a wall, after one control period; brakes if not ``armed``."""
+    """Vehicle, controller and speed [] at a wall, after one control period; it brakes if not ``armed``."""
     step = make_skid_steer_step(engine, dt)
     speed, yaw_rate = pursue(params, vehicle, command.position_m, command.speed_m_s)
     to_point = command.level == DRIVE_TO

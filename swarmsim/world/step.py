@@ -34,9 +34,7 @@ def reset(world: World, key: jax.Array, *, active: bool = True) -> WorldState:
     """
     groups = tuple(_group_start(world, group, key, active) for group in world.groups)
     clock = Clock(tick=jnp.int32(0), running=jnp.ones(len(groups), bool))
-    return WorldState(
-        clock=clock, key=key, groups=groups, radio=radio_start(world, groups), crowded=jnp.array(False)
-    )
+    return WorldState(clock=clock, key=key, groups=groups, radio=radio_start(world, groups), crowded=jnp.array(False))
 
 
 def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> GroupState:
@@ -170,7 +168,8 @@ def _advance_group(
         return _Moved(vehicle=kept[0], control=kept[1], impact_m_s=impact, finite=state.finite & finite)
 
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
-    moved = over_vehicles(one, in_axes=(0, 0, 0, None), layout=world.layout, unroll=1)(group.params, seen, command, world.site)
+    every = over_vehicles(one, in_axes=(0, 0, 0, None), layout=world.layout, unroll=1)
+    moved = every(group.params, seen, command, world.site)
     after = replace(
         before, vehicle=moved.vehicle, control=moved.control, impact_m_s=moved.impact_m_s, finite=moved.finite
     )

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from swarmsim.missions import events, keys
 from swarmsim.missions.batching import batched, in_groups, shards_of, spread
 from swarmsim.missions.flight import Traffic, follow, keep_apart
 from swarmsim.missions.stage import Clock, Stage
+
+from swarmsim.missions import events, keys
 from swarmsim.policies.path import Path
 
 ACTIVE = jnp.array([True, True, True])

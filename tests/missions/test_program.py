@@ -89,7 +89,9 @@ def test_other_values_and_seeds_compile_nothing(climbing):
         assert track[-1] - track[0] == pytest.approx(height, abs=0.5)
     # another simulation that differs in values only finds the programs of the first
     other = swarmsim.build(
-        swarmsim.load(climbing.scenario.mission_file, ["wind.speed_m_s=4", "definitions.vehicles.tarot_t650.mass_kg=3.6"])
+        swarmsim.load(
+            climbing.scenario.mission_file, ["wind.speed_m_s=4", "definitions.vehicles.tarot_t650.mass_kg=3.6"]
+        )
     )
     assert not other.rollout([1, 2, 3]).clock.compiled
 

@@ -1,28 +1,38 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmsim.policies.ground_search import approach_and_orbit
-from swarmsim.policies.routes import coarsen, cost_to_go, descend
-from swarmsim.policies.tasks import GroundTask
+from swarmsim.policies.ground_search import ApproachAndOrbit, SearchTask
+from swarmsim.policies.routes import coarsen, cost_to_go, descend, smooth
+from tests.policies.assignments import assignment, situation
 from tests.policies.sites import block_site
 
-drive = jax.jit(approach_and_orbit)
+planner = ApproachAndOrbit()
+plan = jax.jit(planner.plan)
+TARGET = (10.0, 4.0)
 
 
-def make_task(start, target, standoff=4.0, viewpoints=8, radius=0.6, laps=1):
-    values = {"standoff_m": standoff, "speed_m_s": 0.9, "acceleration_m_s2": 0.5, "rover_radius_m": radius}
-    return GroundTask(
-        start_m=jnp.array(start, jnp.float32),
-        target_m=jnp.array(target, jnp.float32),
+def make_task(rovers=1, standoff=4.0, viewpoints=8, radius=0.6, laps=1):
+    return SearchTask(
+        standoff_m=jnp.float32(standoff),
+        speed_m_s=jnp.float32(0.9),
+        acceleration_m_s2=jnp.full(rovers, 0.5),
+        radius_m=jnp.full(rovers, radius),
         viewpoints=viewpoints,
         laps=laps,
         block=2,
         window=20,
         points=512,
-        **{name: jnp.float32(value) for name, value in values.items()},
     )
+
+
+def drive(start, target, site, **task):
+    """The path of one rover."""
+    paths = plan(make_task(**task), site, situation([start], target))
+    return jax.tree.map(lambda x: x[0], paths)
 
 
 def test_cost_to_go_on_open_ground_is_the_distance_within_the_grid_error():
@@ -62,11 +72,20 @@ def test_coarse_cells_are_blocked_where_the_rover_does_not_fit():
     assert np.isfinite(coarse).sum() == 14
 
 
+def test_a_smoothed_line_keeps_its_ends_and_its_straight_parts():
+    along = jnp.arange(0.0, 20.5, 0.5)
+    corner = jnp.stack([jnp.minimum(along, 10.0), jnp.maximum(along - 10.0, 0.0)], axis=1)
+    rounded = np.asarray(smooth(corner, 4))
+    np.testing.assert_allclose(rounded[[0, -1]], np.asarray(corner)[[0, -1]], atol=1e-5)
+    np.testing.assert_allclose(rounded[5:12], np.asarray(corner)[5:12], atol=1e-4)
+    assert 0.3 < np.linalg.norm(rounded[20] - [10.0, 0.0]) < 1.0
+    np.testing.assert_allclose(smooth(corner, 0), corner, atol=1e-5)
+
+
 @pytest.mark.parametrize("start", [(-30.0, -20.0), (30.0, 20.0), (-30.0, 20.0)])
 def test_route_starts_at_the_rover_avoids_obstacles_and_goes_round_the_target(start):
     blocks = [(-12, -10, 2, 10), (7, 2.5, 13, 5.5)]
-    path = drive(make_task(start, (10.0, 4.0)), block_site(blocks))
-    points = np.asarray(path.points_m)[:, :2]
+    points = np.asarray(drive(start, TARGET, block_site(blocks)).points_m)[:, :2]
     np.testing.assert_allclose(points[0], start, atol=1e-3)
     for west, south, east, north in blocks:
         gap = np.hypot(
@@ -74,29 +93,60 @@ def test_route_starts_at_the_rover_avoids_obstacles_and_goes_round_the_target(st
             np.maximum.reduce([south - points[:, 1], points[:, 1] - north, np.zeros(len(points))]),
         )
         assert gap.min() > 0.45
-    near = points[np.linalg.norm(points - [10, 4], axis=1) < 7]
+    near = points[np.linalg.norm(points - TARGET, axis=1) < 7]
     angle = np.unwrap(np.arctan2(near[:, 1] - 4, near[:, 0] - 10))
     assert np.ptp(angle) > 1.5 * np.pi
 
 
 def test_second_lap_goes_round_again():
     site = block_site([(7, 2.5, 13, 5.5)])
-    once, twice = (drive(make_task((-30.0, -20.0), (10.0, 4.0), laps=laps), site) for laps in (1, 2))
+    once, twice = (drive((-30.0, -20.0), TARGET, site, laps=laps) for laps in (1, 2))
     lap = float(twice.length_m - once.length_m)
     assert 2 * np.pi * 3.5 < lap < 2 * np.pi * 6.5
 
 
-def test_unreachable_target_leaves_the_rover_where_it_is():
-    walls = [(-2, -30, 0, 30)]
-    path = drive(make_task((-30.0, 0.0), (20.0, 0.0)), block_site(walls))
+@pytest.mark.parametrize("target", [(20.0, 0.0), None], ids=["behind a wall", "not found"])
+def test_without_a_target_that_can_be_reached_the_rover_stays_where_it_is(target):
+    path = drive((-30.0, 0.0), target, block_site([(-2, -30, 0, 30)]))
     assert float(path.length_m) == 0.0
     np.testing.assert_allclose(np.asarray(path.points_m)[:, :2], [[-30.0, 0.0]] * 512, atol=1e-4)
 
 
+def test_each_rover_has_its_own_route_by_its_own_width():
+    """Through a gap of 4 m the narrow one goes, the wide one round the wall."""
+    site = block_site([(-2, -30, 0, -2.0), (-2, 2.0, 0, 20)])
+    task = make_task(rovers=2)
+    wide = jnp.array([0.6, 2.6])
+    paths = plan(dataclasses.replace(task, radius_m=wide), site, situation([(-20.0, -2.0), (-20.0, 2.0)], TARGET))
+    narrow, wide = np.asarray(paths.points_m)
+    np.testing.assert_allclose(narrow[0, :2], [-20.0, -2.0], atol=1e-3)
+    np.testing.assert_allclose(wide[0, :2], [-20.0, 2.0], atol=1e-3)
+    assert narrow[:, 1].max() < 12.0
+    assert wide[:, 1].max() > 20.0
+    alone = drive((-20.0, -2.0), TARGET, site)
+    np.testing.assert_allclose(narrow, alone.points_m, atol=1e-4)
+
+
 def test_batched_routes_equal_single_ones():
     site = block_site([(-12, -10, 2, 10)])
-    tasks = [make_task((-30.0, -20.0), target) for target in ((10.0, 4.0), (-20.0, 15.0), (25.0, -20.0))]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *tasks)
-    together = jax.jit(jax.vmap(approach_and_orbit, in_axes=(0, None)))(batch, site)
-    for k, task in enumerate(tasks):
-        np.testing.assert_allclose(together.points_m[k], drive(task, site).points_m, atol=1e-4)
+    targets = (TARGET, (-20.0, 15.0), (25.0, -20.0))
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *[situation([(-30.0, -20.0)], target) for target in targets])
+    together = jax.jit(jax.vmap(planner.plan, in_axes=(None, None, 0)))(make_task(), site, batch)
+    for k, target in enumerate(targets):
+        np.testing.assert_allclose(together.points_m[k, 0], drive((-30.0, -20.0), target, site).points_m, atol=1e-4)
+
+
+def test_the_task_of_a_phase_has_the_rovers_limits_and_sizes():
+    site = block_site()
+    made = assignment(
+        "approach_and_orbit", "orpheus", [(-30.0, -20.0)], site, target=TARGET, speed_m_s=0.8, standoff_m=5.0, laps=2
+    )
+    task = planner.task(made)
+    np.testing.assert_allclose(task.radius_m, [0.5 * 0.42 + 0.3])  # half the chassis and a margin
+    np.testing.assert_allclose(task.acceleration_m_s2, [0.5])
+    assert (task.viewpoints, task.laps, task.block, task.window) == (8, 2, 2, 25)
+    path = jax.tree.map(lambda x: x[0], plan(task, site, situation([(-30.0, -20.0)], TARGET)))
+    distance = np.linalg.norm(np.asarray(path.points_m)[:, :2] - TARGET, axis=1)
+    assert distance.min() > 3.5
+    assert np.all(np.asarray(path.speed_m_s) <= 0.8 + 1e-6)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(path.points_m, axis=0), axis=1).max(), path.spacing_m, rtol=0.05)
