@@ -1,4 +1,4 @@
-"""Settings of the whole suite: CPU, a compilation cache of its own, deterministic hypothesis."""
+"""Settings of the whole suite: CPU, a folder of its own for compiled programs, deterministic hypothesis."""
 
 import os
 import tempfile
@@ -9,9 +9,7 @@ os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that the spreading of ba
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see swarmsim/__init__.py
 _CACHE = Path(os.environ.get("SWARMSIM_TEST_CACHE", Path(tempfile.gettempdir()) / "swarmsim-test-cache"))
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
-os.environ.setdefault("SWARMSIM_CACHE_DIR", str(_CACHE / "swarmsim"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("SWARMSIM_CACHE_DIR", str(_CACHE))
 
 from hypothesis import settings  # noqa: E402 - the environment is set first
 

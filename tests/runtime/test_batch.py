@@ -1,0 +1,87 @@
+"""The mission axis: what is shared, how missions run side by side or in turn, and on how many devices."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.runtime import batch
+from swarmsim.runtime.batch import SMALL, Batch, filled, shards_of
+from swarmsim.runtime.clock import Clock
+
+LARGE = np.arange(SMALL + 1, dtype=np.float32)
+
+
+def grown(inputs, carried, factor):
+    """Until it is small: missions take different numbers of rounds."""
+    start = inputs["scale"] * carried + 0.0 * inputs["large"][0]
+    return jax.lax.while_loop(lambda v: v > 0.7, lambda v: factor * v, start)
+
+
+def of_mission(scale, large=LARGE):
+    return {"scale": np.float32(scale), "large": large}
+
+
+def alone(scale, value, factor=0.5):
+    value = np.float32(scale * value)
+    while value > 0.7:
+        value *= factor
+    return value
+
+
+def test_a_batch_is_spread_only_where_every_device_gets_two():
+    devices = len(jax.devices())
+    assert devices == 2
+    assert [shards_of(n) for n in (1, 2, 3, 4, 5, 1000)] == [1, 1, 1, 2, 2, devices]
+    np.testing.assert_array_equal(filled(np.array([3, 4, 5, 6, 7])), [3, 4, 5, 6, 7, 7])
+    np.testing.assert_array_equal(filled(np.array([3, 4, 5])), [3, 4, 5])
+
+
+def test_small_arrays_carry_the_mission_axis_and_large_ones_only_where_they_differ():
+    missions = Batch(3, Clock())
+    alike = missions.spread([of_mission(2.0)])
+    assert (len(alike.own), len(alike.shared)) == (1, 1)
+    np.testing.assert_array_equal(alike.own[0], [2.0, 2.0, 2.0])
+    other = missions.spread([of_mission(1.0), of_mission(2.0, LARGE + 1.0), of_mission(3.0)])
+    assert (len(other.own), len(other.shared)) == (2, 0)
+    for number, (scale, first) in enumerate([(1.0, 0.0), (2.0, 1.0), (3.0, 0.0)]):
+        own = other.of(number)
+        assert (own["scale"], own["large"][0]) == (scale, first)
+    np.testing.assert_array_equal(alike.of(1)["large"], LARGE)
+
+
+@pytest.mark.parametrize("together", [1, 2])
+@pytest.mark.parametrize("in_turn", [False, True])
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_missions_side_by_side_or_in_turn_or_on_two_devices_are_each_its_own(count, in_turn, together, monkeypatch):
+    monkeypatch.setattr(batch, "_together", lambda: together)
+    scales, values = np.arange(1.0, count + 1.0), 10.0 ** np.arange(count, dtype=np.float32)
+    missions = Batch(count, Clock())
+    inputs = missions.spread([of_mission(scale) for scale in scales])
+    name = f"grown {in_turn} {together}"
+    result = missions.run(name, grown, [inputs], missions.put(values), (np.float32(0.5),), in_turn=in_turn)
+    np.testing.assert_array_equal(result, [alone(s, v) for s, v in zip(scales, values, strict=True)])
+    assert len(result.sharding.device_set) == (2 if count == 4 else 1)
+
+
+def test_only_the_missions_that_are_asked_for_change():
+    missions = Batch(4, Clock())
+    inputs = missions.spread([of_mission(1.0)])
+    values = missions.put(np.array([10.0, 20.0, 30.0, 40.0], np.float32))
+    asked = missions.put(np.array([True, False, False, True]))
+    result = missions.run("some", grown, [inputs], values, (np.float32(0.5),), only=asked)
+    np.testing.assert_array_equal(result, [alone(1.0, 10.0), 20.0, 30.0, alone(1.0, 40.0)])
+
+
+def test_other_values_need_no_other_program():
+    clock = Clock()
+    missions = Batch(2, clock)
+    values = missions.put(jnp.array([3.0, 5.0]))
+    missions.run("again", grown, [missions.spread([of_mission(1.0)])], values, (np.float32(0.5),))
+    clock.reset()
+    inputs = missions.spread([of_mission(2.0), of_mission(7.0)])
+    result = missions.run("again", grown, [inputs], values, (np.float32(0.25),))
+    np.testing.assert_array_equal(result, [alone(2.0, 3.0, 0.25), alone(7.0, 5.0, 0.25)])
+    assert not clock.compiled
+    assert not clock.loaded
+    assert clock.run_s > 0.0
