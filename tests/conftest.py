@@ -1,7 +1,9 @@
 """Settings of the whole suite: CPU, a folder of its own for compiled programs, deterministic hypothesis."""
 
+import gc
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -11,7 +13,21 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see swarmsim/__init__.py
 _CACHE = Path(os.environ.get("SWARMSIM_TEST_CACHE", Path(tempfile.gettempdir()) / "swarmsim-test-cache"))
 os.environ.setdefault("SWARMSIM_CACHE_DIR", str(_CACHE))
 
-from hypothesis import settings  # noqa: E402 - the environment is set first
+# the environment is set first
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+from swarmsim.runtime import programs  # noqa: E402
 
 settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("deterministic")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs() -> Iterator[None]:
+    """Free each file's compiled programs: some hundred of them would use up a process's memory maps."""
+    yield
+    programs.forget()
+    jax.clear_caches()
+    gc.collect()

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path as FilePath
 from typing import Any
 
 import jax
@@ -17,16 +16,18 @@ from swarmsim.site import Site
 
 @dataclass(frozen=True)
 class PolicyReference:
-    """A policy by its name; the digest of its source tells programs of an edited file apart."""
+    """A policy by its name; the digest of its source tells programs of an edited file apart.
 
-    reference: str
-    near: str | None
+    Where the mission's file lies is not in it: a copy of the mission flies by the same programs.
+    """
+
+    reference: str  # a name, ``package.module:object``, or the absolute path of a file: ``/…/file.py:object``
     digest: str
 
     @property
     def object(self) -> Any:
         """The policy, or the planner."""
-        return registry.find(self.reference, None if self.near is None else FilePath(self.near))
+        return registry.find(self.reference)
 
 
 @jax.tree_util.register_pytree_node_class

@@ -28,9 +28,9 @@ def listens(scenario: Scenario) -> bool:
 
 def _policy(scenario: Scenario, phase: PhaseSpec) -> PolicyReference:
     near = scenario.mission_file
-    return PolicyReference(
-        reference=phase.policy, near=None if near is None else str(near), digest=registry.digest(phase.policy, near)
-    )
+    file = registry.policy_file(phase.policy, near)
+    reference = phase.policy if file is None else f"{file}:{phase.policy.rpartition(':')[2]}"
+    return PolicyReference(reference=reference, digest=registry.digest(phase.policy, near))
 
 
 def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:

@@ -96,6 +96,11 @@ class Executables:
             while len(self._by_key) > self._most:
                 del self._by_key[next(iter(self._by_key))]
 
+    def clear(self) -> None:
+        """Drop all."""
+        with self._lock:
+            self._by_key.clear()
+
 
 def cache_reads() -> int:
     """How many programs this thread has compiled by reading JAX's persistent cache, where a user has switched that on.

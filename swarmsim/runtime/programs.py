@@ -113,7 +113,7 @@ class Program:
         def flat(*leaves: Any) -> list[Any]:
             results, tree = jax.tree.flatten(self._function(*jax.tree.unflatten(structure, leaves)))
             trees.append(tree)
-            return results
+            return [_strongly_typed(result) for result in results]
 
         flat.__name__ = self.name.replace(" ", "_")  # what profilers show
         ends = [0, *itertools.accumulate(len(jax.tree.leaves(argument)) for argument in arguments)]
@@ -154,6 +154,11 @@ def prepare(work: Sequence[tuple[Program, Sequence[Any]]]) -> None:
         program._clock.add(source, program.name, seconds * share)
 
 
+def forget() -> None:
+    """Drop the executables that this process keeps for programs to come; those in use stay with their programs."""
+    _EXECUTABLES.clear()
+
+
 @contextmanager
 def uncollected() -> Iterator[None]:
     """Pause the cyclic garbage collector, which takes 25 % of the time of tracing."""
@@ -166,7 +171,9 @@ def uncollected() -> Iterator[None]:
             gc.enable()
 
 
-_EXECUTABLES = Executables(most=256)  # bounds the memory of a process that meets ever new scenarios
+# A mission's larger programs take about 1,500 memory maps each, of the 65,530 that Linux allows a process, and some
+# 100 MB: a process that meets ever new scenarios keeps those of the last few.
+_EXECUTABLES = Executables(most=16)
 
 
 def _warn_not_kept(name: str, reason: Exception) -> None:
@@ -185,6 +192,12 @@ def _leaf(leaf: Any) -> tuple[Any, ...]:
     kind = jax.typeof(leaf)
     placement = leaf.sharding if getattr(leaf, "committed", False) else None
     return kind.shape, kind.dtype, kind.weak_type, placement
+
+
+def _strongly_typed(result: Any) -> Any:
+    """The result with a fixed type: a state that goes round from program to program then always looks the same."""
+    weak = jax.typeof(result).weak_type
+    return jax.lax.convert_element_type(result, result.dtype) if weak else result
 
 
 def _leaf_text(leaf: Any) -> str:

@@ -114,6 +114,8 @@ def test_a_run_is_written_whole_and_flies_again(tmp_path):
     for name in (MEASUREMENTS, TRAJECTORIES, "mission.rrd", "radiation_map.npz", "summary.json", "scenario.yaml"):
         assert (tmp_path / "first" / name).stat().st_size > 0
     again = swarmsim.load(tmp_path / "first" / "scenario.yaml")
+    moved, here = (jax.tree.structure(swarmsim.build(each).plan) for each in (again, scenario))
+    assert moved == here  # a copy of the mission flies by the same programs
     (record,) = swarmsim.run(again, tmp_path / "second")
     summary = json.loads((tmp_path / "second" / "summary.json").read_text(encoding="utf-8"))
     assert summary["source"]["position_m"] == pytest.approx(list(record.estimate.position_m), abs=1e-3)

@@ -372,3 +372,13 @@ def test_programs_read_from_jaxs_cache_are_not_stored(tmp_path: Path, folder: Pa
     shutil.rmtree(folder)
     assert separate(**cached) == first  # compiled from JAX's cache
     assert list(folder.iterdir()) == []
+
+
+def test_a_state_that_goes_round_finds_its_program_whatever_it_was_made_of():
+    clock = Clock()
+    begin = Program("begin", lambda n: jnp.full(3, jnp.inf) if n.ndim == 0 else n, clock=clock)
+    go_on = Program("go on", lambda x: x + 1.0, clock=clock)
+    state = begin(jnp.zeros(()))
+    assert not jax.typeof(state).weak_type
+    go_on(go_on(state))
+    assert len(go_on._executables) == 1

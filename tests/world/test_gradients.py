@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from swarmsim.control.commands import go_to
+from swarmsim.runtime.clock import Clock
+from swarmsim.runtime.programs import Program
 from swarmsim.world.step import reset, step
 from tests.world.worlds import TICK_S, airborne, row, world
 
@@ -58,16 +60,18 @@ def fly(field, inputs):
     return jnp.concatenate([group.vehicle.body.position_m[0], 0.1 * others])
 
 
+def with_gradients(field, inputs):
+    """Outcome [5] of the flight and its derivatives [5, ...] with respect to every input."""
+    value, pull = jax.vjp(partial(fly, field), inputs)
+    return value, jax.vmap(lambda output: pull(output)[0])(jnp.eye(OUTPUTS))
+
+
 @pytest.mark.parametrize("engine", ["analytic", "mjx"])
 def test_gradients_equal_central_differences(engine):
     uav = row("uav", "tarot_t650", 1, (0.4, 0.2))
     field = world(uav, engine=engine, sources=[SOURCE], sample_period_s={"nai_1p5x1p5": 0.25})
 
-    @jax.jit
-    def both(inputs):
-        value, pull = jax.vjp(partial(fly, field), inputs)
-        return value, jax.vmap(lambda output: pull(output)[0])(jnp.eye(OUTPUTS))
-
+    both = partial(Program("flight with its gradients", with_gradients, clock=Clock()), field)
     value, gradient = both(INPUTS)
     assert np.isfinite(value).all()
     for name, leaf in INPUTS.items():

@@ -14,6 +14,8 @@ from swarmsim.config.mission import Mission
 from swarmsim.config.scenario import Scenario, scenario_of
 from swarmsim.control.commands import go_to, multirotor_command, skid_steer_command
 from swarmsim.pytree import pytree
+from swarmsim.runtime.clock import Clock
+from swarmsim.runtime.programs import Program
 from swarmsim.world import events
 from swarmsim.world.build import build_world
 from swarmsim.world.model import World
@@ -82,8 +84,7 @@ class Track:
     angular_velocity_rad_s: Any  # [T, U, 3]
 
 
-@jax.jit
-def _block(world: World, state: WorldState, commands: tuple) -> tuple[WorldState, tuple[Track, ...]]:
+def _steps(world: World, state: WorldState, commands: tuple) -> tuple[WorldState, tuple[Track, ...]]:
     def tick(state: WorldState, _: None) -> tuple[WorldState, tuple[Track, ...]]:
         state, _ = step(world, state, commands)
         bodies = [g.vehicle.body for g in state.groups]
@@ -98,9 +99,10 @@ def fly(world: World, state: WorldState, commands: tuple, seconds: float) -> tup
     All flights share one program: commands of any level are written out as full ones.
     """
     full = tuple(full_command(world, number, command) for number, command in enumerate(commands))
+    block = Program("block of steps", _steps, clock=Clock())  # which other test files find compiled
     tracks = []
     for _ in range(round(seconds / BLOCK / TICK_S)):
-        state, track = _block(world, state, full)
+        state, track = block(world, state, full)
         tracks.append(track)
     return state, jax.tree.map(lambda *parts: np.concatenate(parts), *tracks)
 
