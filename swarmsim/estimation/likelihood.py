@@ -15,7 +15,7 @@ from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector, Source, net_rate, observed_rate
 from swarmsim.site import Site, sample, sample_with_gradient
-from swarmsim.site.horizon import Ceilings, ceilings, path_lengths_from
+from swarmsim.site.horizon import BLOCK, Ceilings, ceilings, path_lengths_from
 
 STEP_SHARE = 0.05  # step of the central differences over the distance of the nearest window: a relative error of 0.25 %
 STEP_M = (0.02, 1.0)  # shortest and longest step
@@ -67,21 +67,33 @@ def net_rates(
 
     The mean over the way of the crystal during the measurement, by a ray to the middle of each of ``rays`` equal parts
     of it: within each, 1/r² is integrated in closed form and the rest taken as constant. ``above`` is the site's
-    pyramid of `ceilings`, where the caller has it already.
+    pyramid of `ceilings`, where the caller has it already. Rows that are not valid have some rate or zero; sort them
+    last, for blocks without a valid row cost nothing (except under `vmap`, where a `cond` evaluates both branches).
     """
     above = ceilings(site) if above is None else above
     source = Source(position_m=position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
     middle = (jnp.arange(rays) + 0.5) / rays - 0.5
-    crystal = (m.position_m[:, None] + middle[:, None] * m.travel_m[:, None]).reshape(-1, 3)
-    axis, way, which = (jnp.repeat(x, rays, axis=0) for x in (m.axis, m.travel_m / rays, m.detector))
-    lengths = path_lengths_from(site, above, position_m, crystal)
 
-    def rate(detector: Detector) -> jax.Array:
-        each = jax.vmap(lambda through, place, axis: net_rate(detector, source, through, place, axis))
-        return each(lengths, crystal, axis)
+    def of_block(block: Measurements) -> jax.Array:
+        crystal = (block.position_m[:, None] + middle[:, None] * block.travel_m[:, None]).reshape(-1, 3)
+        axis, way, which = (jnp.repeat(x, rays, axis=0) for x in (block.axis, block.travel_m / rays, block.detector))
+        lengths = path_lengths_from(site, above, position_m, crystal)
 
-    rates = _of_detector([rate(d) for d in detectors], which) * travel_gain(crystal - position_m, way)
-    return jnp.mean(rates.reshape(-1, rays), axis=1)
+        def rate(detector: Detector) -> jax.Array:
+            each = jax.vmap(lambda through, place, axis: net_rate(detector, source, through, place, axis))
+            return each(lengths, crystal, axis)
+
+        rates = _of_detector([rate(d) for d in detectors], which) * travel_gain(crystal - position_m, way)
+        return jnp.mean(rates.reshape(-1, rays), axis=1)
+
+    def of_valid(block: Measurements) -> jax.Array:
+        return jax.lax.cond(jnp.any(block.valid), of_block, lambda block: jnp.zeros_like(block.counts), block)
+
+    n = m.counts.shape[0]
+    size = min(n, max(1, BLOCK // rays))
+    padded = jax.tree.map(lambda x: jnp.pad(x, [(0, -n % size)] + [(0, 0)] * (x.ndim - 1)), m)
+    blocks = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), padded)
+    return jax.lax.map(of_valid, blocks).reshape(-1)[:n]
 
 
 def exact_rates(problem: FitProblem, position_m: jax.Array) -> jax.Array:
