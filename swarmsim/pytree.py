@@ -17,6 +17,11 @@ def on_host(value: Any, dtype: Any = np.float32) -> Any:
     return np.asarray(value, dtype)
 
 
+def on_device(value: Any, dtype: Any = np.float32) -> jax.Array:
+    """An array of JAX, made on the host and put on the device: `jnp.asarray` compiles a program for each shape."""
+    return jax.device_put(np.asarray(value, dtype))
+
+
 def static(**kwargs: Any) -> Any:
     """A field that is not traced: changing it compiles anew."""
     return dataclasses.field(metadata={"static": True}, **kwargs)

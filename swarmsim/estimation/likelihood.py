@@ -67,8 +67,9 @@ def net_rates(
 
     The mean over the way of the crystal during the measurement, by a ray to the middle of each of ``rays`` equal parts
     of it: within each, 1/r² is integrated in closed form and the rest taken as constant. ``above`` is the site's
-    pyramid of `ceilings`, where the caller has it already. Rows that are not valid have some rate or zero; sort them
-    last, for blocks without a valid row cost nothing (except under `vmap`, where a `cond` evaluates both branches).
+    pyramid of `ceilings`, where the caller has it already. Rows that are not valid have some rate or zero. Order rows
+    as `in_blocks` does: only the rays of valid rows cost time, and each only for its own detector (except under `vmap`,
+    where a `cond` evaluates both branches).
     """
     above = ceilings(site) if above is None else above
     source = Source(position_m=position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
@@ -76,15 +77,19 @@ def net_rates(
 
     def of_block(block: Measurements) -> jax.Array:
         crystal = (block.position_m[:, None] + middle[:, None] * block.travel_m[:, None]).reshape(-1, 3)
-        axis, way, which = (jnp.repeat(x, rays, axis=0) for x in (block.axis, block.travel_m / rays, block.detector))
+        axis, way = (jnp.repeat(x, rays, axis=0) for x in (block.axis, block.travel_m / rays))
         lengths = path_lengths_from(site, above, position_m, crystal)
+        gain = travel_gain(crystal - position_m, way)
 
         def rate(detector: Detector) -> jax.Array:
             each = jax.vmap(lambda through, place, axis: net_rate(detector, source, through, place, axis))
-            return each(lengths, crystal, axis)
+            return jnp.mean((each(lengths, crystal, axis) * gain).reshape(-1, rays), axis=1)
 
-        rates = _of_detector([rate(d) for d in detectors], which) * travel_gain(crystal - position_m, way)
-        return jnp.mean(rates.reshape(-1, rays), axis=1)
+        def of_own(number: int, detector: Detector) -> jax.Array:
+            used = jnp.any(block.valid & (block.detector == number))
+            return jax.lax.cond(used, lambda: rate(detector), lambda: jnp.zeros_like(block.counts))
+
+        return _of_detector([of_own(k, d) for k, d in enumerate(detectors)], block.detector)
 
     def of_valid(block: Measurements) -> jax.Array:
         return jax.lax.cond(jnp.any(block.valid), of_block, lambda block: jnp.zeros_like(block.counts), block)
@@ -94,6 +99,14 @@ def net_rates(
     padded = jax.tree.map(lambda x: jnp.pad(x, [(0, -n % size)] + [(0, 0)] * (x.ndim - 1)), m)
     blocks = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), padded)
     return jax.lax.map(of_valid, blocks).reshape(-1)[:n]
+
+
+def in_blocks(m: Measurements) -> jax.Array:
+    """The order [n] in which `net_rates` is cheapest: detector by detector, from the ground up, the invalid ones last.
+
+    Windows near the ground stand next to one another, because only their rays need to be followed through the terrain.
+    """
+    return jnp.lexsort((m.position_m[:, 2], m.detector, ~m.valid))
 
 
 def exact_rates(problem: FitProblem, position_m: jax.Array) -> jax.Array:

@@ -14,6 +14,7 @@ from swarmsim.estimation.likelihood import (
     Evaluation,
     FitProblem,
     evaluate,
+    in_blocks,
     position_covariance,
     position_of,
     scaled_inverse,
@@ -111,10 +112,8 @@ def localise(
     """
     m = cleared(measurements)
     extra = jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), m.counts.shape)
-    # Windows near the ground next to one another: only their rays need to be followed through the terrain. Invalid
-    # ones, which `cleared` has put high up, come last.
-    low_first = jnp.argsort(m.position_m[:, 2])
-    m, extra = jax.tree.map(lambda leaf: leaf[low_first], (m, extra))
+    order = in_blocks(m)
+    m, extra = jax.tree.map(lambda leaf: leaf[order], (m, extra))
     problem = FitProblem(
         site=site,
         above=ceilings(site),

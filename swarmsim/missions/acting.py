@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim import randomness
 from swarmsim.control.commands import PositionCommand, multirotor_command
 from swarmsim.missions.plan import Phase, Place, Plan
 from swarmsim.missions.state import MissionState, PhaseState
 from swarmsim.policies.follow import FollowByAir, FollowByGround
 from swarmsim.policies.view import Belief, Task, View
-from swarmsim.runtime.scalars import over_vehicles
-from swarmsim.world import randomness
+from swarmsim.scalars import over_vehicles
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import World
 from swarmsim.world.radio import heard

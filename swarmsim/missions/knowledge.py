@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim import randomness
 from swarmsim.estimation import (
     Measurements,
     SourceFit,
@@ -22,7 +23,6 @@ from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.rate import spectrum_rate
 from swarmsim.site import Site, path_lengths
-from swarmsim.world import randomness
 from swarmsim.world.model import World
 
 

@@ -3,14 +3,13 @@
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.radiation import Detector as DetectorSpec
 from swarmsim.config.radiation import DetectorMount, Material
-from swarmsim.pytree import pytree, static
+from swarmsim.pytree import on_device, pytree, static
 from swarmsim.radiation.cylinder import fit_effective_area
 from swarmsim.radiation.library import Library, build_up_coefficients, linear_attenuation, mass_attenuation
 from swarmsim.radiation.response import (
@@ -90,7 +89,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         silhouette = np.array([0.0, np.pi * radius**2, 2 * radius * length, 0.0, 0.0])
         area = np.broadcast_to(silhouette, (*energy.shape, 5))
     axis = np.asarray(mount.axis) / np.linalg.norm(mount.axis)
-    f32 = _float32
+    f32 = on_device
     return Detector(
         radius_m=f32(radius),
         length_m=f32(length),
@@ -131,10 +130,6 @@ def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
     transport = detector.transport_1_m[rows, :, :lines]
     shielding = detector.shielding[rows, :, :lines]
     return replace(detector, transport_1_m=transport, shielding=shielding, nuclide_names=nuclides, **tables)
-
-
-def _float32(value: object) -> jax.Array:
-    return jnp.asarray(value, jnp.float32)
 
 
 def _transport(library: Library, energy: Floats, kind: str, air: int) -> Floats:

@@ -16,7 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from swarmsim.runtime.clock import Clock
 from swarmsim.runtime.programs import Program, prepare
-from swarmsim.runtime.scalars import Layout
+from swarmsim.scalars import Layout
 
 SMALL = 4096  # elements up to which an array carries the mission axis whether or not missions differ in it
 MANY_VEHICLES = 1024  # of all missions on a device
@@ -109,7 +109,7 @@ class Batch:
         return program(*arguments)
 
     def prepare(self, calls: Sequence[dict[str, Any]]) -> None:
-        """Load or compile the programs of future calls of `run` (its arguments by name), several at a time."""
+        """Begin to load or compile the programs of future calls of `run` (its arguments by name), side by side."""
         prepare([self._call(**({"common": (), "only": None, "in_turn": False} | call)) for call in calls])
 
     def _call(

@@ -15,7 +15,7 @@ from swarmsim.control.commands import PositionCommand
 from swarmsim.control.multirotor import control, control_start
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.multirotor import make_multirotor_step, rest_state
-from swarmsim.runtime.scalars import Layout, over_vehicles
+from swarmsim.scalars import Layout, over_vehicles
 from swarmsim.vehicles.multirotor import MultirotorParams, multirotor_params
 
 TIME_STEP_S = 0.005

@@ -12,7 +12,7 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -59,32 +59,43 @@ class Program:
         self._donate = donate
         self._clock = clock
         self._executables: dict[Any, _Ready] = {}
+        self._coming: dict[Any, Future[tuple[_Ready, Source]]] = {}  # what `prepare` has begun
+        self._last: tuple[Any, _Ready] | None = None  # the last call's marks (see `_marks`) and executable
 
     def __call__(self, *arguments: Any) -> Any:
-        """The function's value, computed to the end; preparing (if needed) and running are timed on the clock."""
+        """The function's value, computed to the end; waiting for the executable and running are timed on the clock."""
         leaves, structure = jax.tree.flatten(arguments)
-        ready = self._executables.get(_situation(leaves, structure))
-        if ready is None:
-            ready, source, seconds = self._obtain(arguments)
-            self._clock.add(source, self.name, seconds)
-        call, tree = ready
+        marks = structure, _marks(leaves), _changeable()
+        if self._last is None or self._last[0] != marks:
+            self._last = marks, self._ready(arguments)
+        call, tree = self._last[1]
         start = time.perf_counter()
         results = jax.block_until_ready(call(*leaves))
         self._clock.add("ran", self.name, time.perf_counter() - start)
         return jax.tree.unflatten(tree, results)
 
-    def _lacks(self, arguments: Sequence[Any]) -> bool:
-        return _situation(*jax.tree.flatten(tuple(arguments))) not in self._executables
+    def _ready(self, arguments: Sequence[Any]) -> _Ready:
+        """The executable for these arguments; the seconds that it is waited for go to the clock."""
+        situation = _situation(*jax.tree.flatten(tuple(arguments)))
+        if situation not in self._executables:
+            start = time.perf_counter()
+            coming = self._coming.pop(situation, None)
+            self._executables[situation], source = self._obtain(arguments) if coming is None else coming.result()
+            self._clock.add(source, self.name, time.perf_counter() - start)
+        return self._executables[situation]
 
-    def _obtain(self, arguments: Sequence[Any]) -> tuple[_Ready, Source, float]:
-        """The executable for these arguments, how it was obtained and the seconds it took."""
-        start = time.perf_counter()
+    def _begin(self, threads: ThreadPoolExecutor, arguments: Sequence[Any]) -> None:
+        """Obtain the executable for these arguments in the background, unless that is done or under way."""
+        situation = _situation(*jax.tree.flatten(tuple(arguments)))
+        if situation not in self._executables and situation not in self._coming:
+            self._coming[situation] = threads.submit(self._obtain, arguments)
+
+    def _obtain(self, arguments: Sequence[Any]) -> tuple[_Ready, Source]:
+        """The executable for these arguments, and how it was obtained."""
         leaves, structure = jax.tree.flatten(tuple(arguments))
         with uncollected():
             key = self._key(leaves, structure)
-            ready, source = (self._compile(arguments), _COMPILED) if key is None else self._shared(key, arguments)
-        self._executables[_situation(leaves, structure)] = ready
-        return ready, source, time.perf_counter() - start
+            return (self._compile(arguments), _COMPILED) if key is None else self._shared(key, arguments)
 
     def _shared(self, key: str, arguments: Sequence[Any]) -> tuple[_Ready, Source]:
         """The executable of a key: of this process, or from the user's folder, or compiled and stored there."""
@@ -137,21 +148,16 @@ class Program:
 
 
 def prepare(work: Sequence[tuple[Program, Sequence[Any]]]) -> None:
-    """Load or compile programs for their arguments, several at a time; arguments may be `jax.ShapeDtypeStruct` trees.
+    """Begin to load or compile programs for their arguments, which may be `jax.ShapeDtypeStruct` trees.
 
-    XLA compiles and loads outside Python's global lock, so the time falls with the cores. The clocks get the elapsed
-    time, divided among the programs in proportion to their own.
+    Returns at once: a call waits for its own program only. XLA compiles and loads outside Python's global lock, so
+    several programs are made side by side, in the order given, while the first of them run already. An error is
+    raised by the call.
     """
-    start = time.perf_counter()
-    missing = [(program, arguments) for program, arguments in work if program._lacks(arguments)]
-    if not missing:
-        return
-    with ThreadPoolExecutor(min(len(missing), os.cpu_count() or 1)) as threads:
-        taken = [threads.submit(program._obtain, arguments) for program, arguments in missing]
-    outcomes = [(source, seconds) for _, source, seconds in (future.result() for future in taken)]
-    share = (time.perf_counter() - start) / sum(seconds for _, seconds in outcomes)
-    for (program, _), (source, seconds) in zip(missing, outcomes, strict=True):
-        program._clock.add(source, program.name, seconds * share)
+    threads = ThreadPoolExecutor(os.cpu_count() or 1, "swarmsim-programs")
+    for program, arguments in work:
+        program._begin(threads, arguments)
+    threads.shutdown(wait=False)
 
 
 def forget() -> None:
@@ -180,9 +186,13 @@ def _warn_not_kept(name: str, reason: Exception) -> None:
     warnings.warn(f"program {name!r} is compiled anew in every process: {reason}", stacklevel=2)
 
 
+def _changeable() -> Hashable:
+    return tuple(getattr(jax.config, name) for name in _CHANGEABLE)
+
+
 def _situation(leaves: Sequence[Any], structure: Any) -> Hashable:
     """What chooses among the executables of one program."""
-    return structure, tuple(map(_leaf, leaves)), tuple(getattr(jax.config, name) for name in _CHANGEABLE)
+    return structure, tuple(map(_leaf, leaves)), _changeable()
 
 
 def _leaf(leaf: Any) -> tuple[Any, ...]:
@@ -192,6 +202,14 @@ def _leaf(leaf: Any) -> tuple[Any, ...]:
     kind = jax.typeof(leaf)
     placement = leaf.sharding if getattr(leaf, "committed", False) else None
     return kind.shape, kind.dtype, kind.weak_type, placement
+
+
+def _marks(leaves: Sequence[Any]) -> list[Any]:
+    """What `_leaf` tells, in objects that results of one program share, so that they are compared in no time."""
+    return [
+        (leaf.aval, getattr(leaf, "committed", False) and leaf.sharding) if hasattr(leaf, "aval") else _leaf(leaf)
+        for leaf in leaves
+    ]
 
 
 def _strongly_typed(result: Any) -> Any:

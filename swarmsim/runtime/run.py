@@ -1,5 +1,7 @@
 """Fly a scenario and leave a run behind: what ``swarmsim run`` does, and what scripts call."""
 
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 
 from swarmsim.config.errors import raise_if_any
@@ -8,7 +10,6 @@ from swarmsim.config.site_checks import check_site
 from swarmsim.results.extract import mission_record
 from swarmsim.results.out_folder import check_out
 from swarmsim.results.record import MissionRecord
-from swarmsim.results.run_directory import write_run
 from swarmsim.results.summary import Timings
 from swarmsim.runtime.progress import Progress, SilentProgress
 from swarmsim.runtime.simulation import MissionBatch, Simulation
@@ -35,13 +36,16 @@ def run(
     """
     tell = progress or SilentProgress()
     check_out(Path(out), force)
-    tell.phase("load the site", 0.0)
-    simulation = build(scenario)
-    first = scenario.mission.seed
-    batch = simulation.rollout(range(first, first + missions), progress=tell)
-    records = tuple(mission_record(simulation, batch, index) for index in range(missions))
-    tell.phase("write", 0.0)
-    write_run(simulation, records, out, timings_of(batch), force=force)
+    # Arrow, Matplotlib and Rerun, which write the run, take two seconds to import: meanwhile the mission flies.
+    with ThreadPoolExecutor(1) as thread:
+        writer = thread.submit(import_module, "swarmsim.results.run_directory")
+        tell.phase("load the site", 0.0)
+        simulation = build(scenario)
+        first = scenario.mission.seed
+        batch = simulation.rollout(range(first, first + missions), progress=tell)
+        records = tuple(mission_record(simulation, batch, index) for index in range(missions))
+        tell.phase("write", 0.0)
+        writer.result().write_run(simulation, records, out, timings_of(batch), force=force)
     return records
 
 

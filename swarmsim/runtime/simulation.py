@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim import randomness
 from swarmsim.config.errors import InputError
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.values import with_values
@@ -21,9 +22,8 @@ from swarmsim.missions.state import Log, MissionState, Signals
 from swarmsim.runtime.batch import Batch, Spread, filled, layout_for
 from swarmsim.runtime.clock import Clock
 from swarmsim.runtime.progress import Progress, SilentProgress
-from swarmsim.runtime.scalars import Layout
+from swarmsim.scalars import Layout
 from swarmsim.site import SiteModel
-from swarmsim.world import randomness
 from swarmsim.world.build import build_world
 from swarmsim.world.model import World
 from swarmsim.world.state import Clock as WorldClock
@@ -225,11 +225,11 @@ class _Run:
         }  # fmt: skip
 
     def _prepare(self, keys: Any, mission: MissionState) -> None:
-        """Load or compile all programs of the mission, side by side."""
+        """Begin to load or compile all programs of the mission, in the order that they are needed."""
         nobody, groups = np.zeros(self._batch.missions, bool), len(mission.world.groups)
-        calls = [self._advance(mission, 0, np.ones(groups, bool))]
+        beginnings = [self._beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
+        calls = [*beginnings[:1], self._advance(mission, 0, np.ones(groups, bool)), *beginnings[1:]]
         calls += [self._conclusion(mission, keys)] if self._estimates else []
-        calls += [self._beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
         self._batch.prepare(calls)
 
     def _first_world(self) -> World:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim import randomness
 from swarmsim.physics.rotations import rotate
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
@@ -115,7 +116,7 @@ def count(
         active: [U] bool, vehicles that have a part in the mission.
         member: [U] int32, number of each vehicle in the mission.
         site, sources: the true world.
-        key: of the mission's counts; a draw depends on it, the time and the vehicle's number only.
+        key: of the mission; a draw depends on it, the time and the vehicle's number only.
         tick, control_period_s: the time.
     """
     state = replace(state, reading=replace(state.reading, fresh=jnp.zeros_like(state.reading.fresh)))
@@ -155,7 +156,7 @@ def _read_out(
     """Draw the counts of a completed exposure and begin the next one."""
     n, vehicles = counter.evaluations, state.used.shape[0]
     live_s = jnp.float32(counter.ticks * n * control_period_s)
-    keys = jax.vmap(lambda u: jax.random.fold_in(jax.random.fold_in(key, tick), u))(member)
+    keys = randomness.per_vehicle(randomness.consumer(key, "counts"), tick, member)
     draw = jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, live_s))
     mean = state.rate_cps / n
     counts, exposure = draw(keys, jax.lax.stop_gradient(mean))

@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import platformdirs
 
@@ -24,6 +23,7 @@ from swarmsim.config.files import available, find
 from swarmsim.config.load import load_model, load_named
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import SiteSpec
+from swarmsim.pytree import on_device
 from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
 from swarmsim.site.source_files import MAX_FILE_MB, check_file
 
@@ -143,22 +143,22 @@ def _model(spec: SiteSpec, arrays: Arrays, material_names: Sequence[str]) -> Sit
         boxes = np.array([[0, 0, 0, 0, 0, 0, 1, 0, 0]], np.float32)
         material = np.zeros(1, np.int32)
     obstacles = Obstacles(
-        centre_m=jnp.asarray(boxes[:, :3]),
-        half_extent_m=jnp.asarray(boxes[:, 3:6]),
-        axis=jnp.asarray(boxes[:, 6:8]),
-        wall_m=jnp.asarray(boxes[:, 8]),
-        material=jnp.asarray(material),
+        centre_m=on_device(boxes[:, :3]),
+        half_extent_m=on_device(boxes[:, 3:6]),
+        axis=on_device(boxes[:, 6:8]),
+        wall_m=on_device(boxes[:, 8]),
+        material=on_device(material, np.int32),
     )
     site = Site(
-        origin_m=jnp.asarray(arrays["grid"][:2], jnp.float32),
-        cell_m=jnp.asarray(arrays["grid"][2], jnp.float32),
-        terrain_m=jnp.asarray(arrays["terrain"]),
-        surface_m=jnp.asarray(arrays["surface"]),
-        clearance_m=jnp.asarray(arrays["clearance"]),
-        cost=jnp.asarray(arrays["cost"]),
+        origin_m=on_device(arrays["grid"][:2]),
+        cell_m=on_device(arrays["grid"][2]),
+        terrain_m=on_device(arrays["terrain"]),
+        surface_m=on_device(arrays["surface"]),
+        clearance_m=on_device(arrays["clearance"]),
+        cost=on_device(arrays["cost"]),
         obstacles=obstacles,
-        survey_area_m=jnp.asarray(arrays["survey_area"]),
-        ground_material=jnp.asarray(names.index(spec.ground_material), jnp.int32),
+        survey_area_m=on_device(arrays["survey_area"]),
+        ground_material=on_device(names.index(spec.ground_material), np.int32),
         material_names=tuple(names),
     )
     mesh = VisualMesh(arrays["vertices"], arrays["triangles"], arrays["colours"])

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.vehicles import Multirotor
-from swarmsim.pytree import pytree
+from swarmsim.pytree import on_device, pytree
 from swarmsim.vehicles.state import GRAVITY_M_S2
 
 GROUND_EFFECT_HEIGHT_MIN = 0.5
@@ -264,4 +264,4 @@ def _spins(spec: Multirotor) -> np.ndarray:
 
 
 def _float32(numbers: dict[str, Any]) -> dict[str, jax.Array]:
-    return {name: jnp.asarray(number, jnp.float32) for name, number in numbers.items()}
+    return {name: on_device(number) for name, number in numbers.items()}

@@ -3,11 +3,10 @@
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.vehicles import SkidSteer
-from swarmsim.pytree import pytree
+from swarmsim.pytree import on_device, pytree
 from swarmsim.vehicles.rover_body import RoverBody, rover_body, steiner
 from swarmsim.vehicles.state import GRAVITY_M_S2
 
@@ -91,7 +90,7 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
         "yaw_gain_1_s": spec.control.yaw_gain_1_s,
         "gravity_m_s2": GRAVITY_M_S2,
     }
-    return SkidSteerParams(**{name: jnp.asarray(value, jnp.float32) for name, value in values.items()})
+    return SkidSteerParams(**{name: on_device(value) for name, value in values.items()})
 
 
 def wheel_spacing(wheel_position_m: jax.Array) -> tuple[jax.Array, jax.Array]:

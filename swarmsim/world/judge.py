@@ -7,8 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from swarmsim import randomness
 from swarmsim.physics.wind import gust_step, gust_velocity, steady_wind
-from swarmsim.world import events, randomness
+from swarmsim.world import events
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 import jax
 
 from swarmsim.physics.contact import Plane
+from swarmsim.scalars import Layout
 from swarmsim.site import Site
 from swarmsim.world import multirotor, skid_steer
 from swarmsim.world.model import Limits
@@ -30,9 +31,9 @@ class Kind(Protocol):
 
     def tick(
         self, params: Any, vehicle: Any, control: Any, command: Any, armed: jax.Array, ground: Plane,
-        wind_m_s: jax.Array, site: Site, *, engine: str, dt: float, substeps: int,
+        wind_m_s: jax.Array, site: Site, *, engine: str, dt: float, substeps: int, layout: Layout,
     ) -> tuple[Any, Any, jax.Array]:  # fmt: skip
-        """Vehicle, controller and impact speed [] after one control period."""
+        """Vehicle, controller and impact speed [] after one control period; ``layout`` is how it is mapped."""
 
     def height(self, params: Any, vehicle: Any, ground: Plane) -> jax.Array:
         """Height [] of the lowest contact point above the ground."""

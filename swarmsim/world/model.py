@@ -10,7 +10,7 @@ import jax
 
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Source
-from swarmsim.runtime.scalars import Layout
+from swarmsim.scalars import Layout
 from swarmsim.sensors.radiation import Counter
 from swarmsim.site import Site
 
@@ -108,7 +108,7 @@ class World:
     groups: tuple[Group, ...]
     timing: Timing
     engine: str = static()  # mjx | analytic
-    layout: Layout = static(default="vmap")  # of vehicles in memory, see `swarmsim.runtime.scalars`
+    layout: Layout = static(default="vmap")  # of vehicles in memory, see `swarmsim.scalars`
 
     @property
     def vehicles(self) -> int:

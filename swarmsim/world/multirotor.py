@@ -11,6 +11,7 @@ from swarmsim.control.multirotor import control_start as controller
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.multirotor import make_multirotor_step, rest_state
 from swarmsim.physics.rotations import yaw_of
+from swarmsim.scalars import Layout
 from swarmsim.site import Site, sample, sample_with_gradient
 from swarmsim.vehicles.multirotor import MultirotorParams
 from swarmsim.vehicles.state import MultirotorState
@@ -71,9 +72,10 @@ def tick(
     engine: Any,
     dt: float,
     substeps: int,
+    layout: Layout,
 ) -> tuple[MultirotorState, ControlMemory, jax.Array]:
     """Vehicle, controller and impact speed [] after one control period; rotors that are not ``armed`` run down."""
-    step = make_multirotor_step(engine, dt)
+    step = make_multirotor_step(engine, dt, layout)
     speeds, memory = control(params, memory, vehicle, command, substeps * dt)
     speeds = jnp.where(armed, speeds, 0.0)
     velocity = vehicle.body.velocity_m_s

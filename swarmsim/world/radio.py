@@ -5,8 +5,8 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim import randomness
 from swarmsim.pytree import pytree
-from swarmsim.world import randomness
 from swarmsim.world.model import World
 from swarmsim.world.neighbours import neighbours
 from swarmsim.world.state import GroupState, RadioState, WorldState

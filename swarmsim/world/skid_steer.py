@@ -10,6 +10,7 @@ from swarmsim.control.skid_steer import pursue, wheel_speeds
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.skid_steer import make_skid_steer_step, rest_state
 from swarmsim.physics.wheels import impact_speed
+from swarmsim.scalars import Layout
 from swarmsim.site import Site
 from swarmsim.vehicles.skid_steer import SkidSteerParams
 from swarmsim.vehicles.state import SkidSteerState
@@ -52,6 +53,7 @@ def tick(
     engine: Any,
     dt: float,
     substeps: int,
+    layout: Layout,
 ) -> tuple[SkidSteerState, tuple[()], jax.Array]:
     """Vehicle, controller and speed [] at a wall, after one control period; it brakes if not ``armed``."""
     step = make_skid_steer_step(engine, dt)

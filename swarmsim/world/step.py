@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from swarmsim import randomness
 from swarmsim.physics.wind import gust_start
 from swarmsim.pytree import pytree
-from swarmsim.runtime.scalars import over_vehicles
+from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import count, counter_start
-from swarmsim.world import events, randomness
+from swarmsim.world import events
 from swarmsim.world.judge import judge
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, World
@@ -156,7 +157,7 @@ def _advance_group(
         armed = state.active & events.able(state.event_time_s)
         vehicle, control, impact = kind.tick(
             params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wind_m_s, site,
-            engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps,
+            engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps, layout=world.layout,
         )  # fmt: skip
         total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))
         finite = jnp.isfinite(total)  # a sum is finite only if all of its parts are
@@ -176,9 +177,8 @@ def _advance_group(
     if group.counter is None or before.counter is None:
         return after
     measuring = after.active & events.able(after.event_time_s)
-    counts = randomness.consumer(key, "counts")
     counter = count(
-        group.counter, before.counter, after.vehicle.body, measuring, group.member, world.site, world.sources, counts,
+        group.counter, before.counter, after.vehicle.body, measuring, group.member, world.site, world.sources, key,
         tick, timing.control_period_s,
     )  # fmt: skip
     return replace(after, counter=counter)

@@ -11,8 +11,8 @@ from swarmsim.estimation import Measurements, cramer_rao_covariance, fisher_info
 from swarmsim.estimation.windows import gather, measured, windows_start
 from swarmsim.missions import knowledge
 from swarmsim.radiation import draw_counts, observed_rate
+from swarmsim.randomness import mission_keys
 from swarmsim.sensors.radiation import source_rate
-from swarmsim.world.randomness import mission_keys
 
 SEEDS = 256
 # Fewer rounds, rays and places than a mission takes: the bound is asked for within 30 %, and there are 256 fits.

@@ -84,7 +84,7 @@ def test_computes_the_function() -> None:
     program = Program("scale", scaled(2.0), clock=Clock())
     np.testing.assert_array_equal(program(np.arange(3.0, dtype=np.float32)), [0.0, 2.0, 4.0])
     np.testing.assert_array_equal(program(jnp.ones((2, 1))), [[2.0], [2.0]])
-    assert program(3.0).weak_type
+    assert not program(3.0).weak_type
     assert not program(jnp.float32(3.0)).weak_type
 
 
@@ -249,18 +249,30 @@ def test_a_function_that_cannot_be_identified_runs_with_a_warning(folder: Path) 
 
 
 def test_prepared_programs_do_not_compile_when_called() -> None:
-    clock = Clock()
+    clock, traced = Clock(), []
+
+    def noted(factor: float) -> Any:
+        def scale(x: jax.Array) -> jax.Array:
+            traced.append(factor)
+            return x * factor
+
+        return scale
+
     made = [Program(f"scale {factor}", scaled(factor), clock=clock) for factor in (1.0, 2.0, 3.0)]
     walking = Program("walk", walk, clock=clock)
-    shapes = jax.eval_shape(start)
-    prepare([*((program, (jax.ShapeDtypeStruct((3,), "float32"),)) for program in made), (walking, shapes)])
-    assert len(clock.compiled) == 4
+    once = Program("once", noted(4.0), clock=clock)
+    shape = (jax.ShapeDtypeStruct((3,), "float32"),)
+    prepare([*((program, shape) for program in made), (walking, jax.eval_shape(start)), (once, shape)])
     assert not clock.ran
-    clock.reset()
     for factor, program in zip((1.0, 2.0, 3.0), made, strict=True):
         np.testing.assert_array_equal(program(jnp.ones(3)), np.full(3, factor))
     walking(*start())
-    prepare([(walking, start())])
+    once(once(jnp.ones(3)))
+    assert traced == [4.0]
+    assert len(clock.compiled) == 5
+    clock.reset()
+    prepare([(walking, start()), (once, shape)])
+    walking(*start())
     assert not clock.compiled
     assert not clock.loaded
 
@@ -272,8 +284,9 @@ def test_an_error_of_the_function_reaches_the_caller() -> None:
     program = Program("wrong", wrong, clock=Clock())
     with pytest.raises(ValueError, match="no such thing"):
         program(1.0)
+    prepare([(program, (1.0,))])
     with pytest.raises(ValueError, match="no such thing"):
-        prepare([(program, (1.0,))])
+        program(1.0)
 
 
 def test_the_least_recently_made_executables_are_dropped() -> None:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.world import randomness
+from swarmsim import randomness
 
 
 def data(keys):

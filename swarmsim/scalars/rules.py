@@ -1,7 +1,7 @@
 """How primitives of small arrays are written as operations on scalars.
 
 An array of one vehicle is a numpy array: of numbers where all of it is constant, otherwise of objects, each a
-`swarmsim.runtime.scalar_graph` scalar. Rearrangements are numpy's own; the rest is written out.
+`swarmsim.scalars.graph` scalar. Rearrangements are numpy's own; the rest is written out.
 """
 
 import itertools
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jax import lax
 
-from swarmsim.runtime.scalar_graph import Graph, Operation, Scalar
+from swarmsim.scalars.graph import Graph, Operation, Scalar
 
 Rule = Callable[..., Any]
 SELECTIONS = 256

@@ -11,9 +11,9 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.extend import core
 
-from swarmsim.runtime.scalar_control import CONTROL
-from swarmsim.runtime.scalar_graph import Graph, store, varying_axes
-from swarmsim.runtime.scalar_interpreter import SMALL, Interpreter, is_small
+from swarmsim.scalars.control import CONTROL
+from swarmsim.scalars.graph import Graph, store, varying_axes
+from swarmsim.scalars.interpreter import SMALL, Interpreter, is_small
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Program:
     def evaluate(self, size: int, mapped: Sequence[bool], *arrays: Any, stores: bool = False) -> list[jax.Array]:
         """Results [N, ...] for N = ``size`` vehicles, as operations on scalars; ``mapped`` arguments have the axis N.
 
-        With ``stores``, results that much depends on are kept in memory (`scalar_graph.to_store`).
+        With ``stores``, results that much depends on are kept in memory (`swarmsim.scalars.graph.to_store`).
         """
         varying: frozenset[str] = frozenset().union(*map(varying_axes, arrays))
         interpreter = Interpreter(Graph(size, varying, stores), CONTROL, self.unroll)

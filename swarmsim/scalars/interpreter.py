@@ -12,9 +12,9 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from swarmsim.runtime.scalar_graph import FOLD_LIMIT, Graph, Node
-from swarmsim.runtime.scalar_indexing import INDEXING
-from swarmsim.runtime.scalar_rules import (
+from swarmsim.scalars.graph import FOLD_LIMIT, Graph, Node
+from swarmsim.scalars.indexing import INDEXING
+from swarmsim.scalars.rules import (
     ELEMENTWISE,
     REARRANGE,
     RULES,

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax import lax
 
-from swarmsim.runtime.scalars import over_vehicles
-from tests.runtime.mapped import (
+from swarmsim.scalars import over_vehicles
+from tests.scalars.mapped import (
     MISSIONS,
     PLATFORMS,
     RASTER,

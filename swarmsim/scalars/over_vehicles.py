@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.runtime.scalar_interpreter import UNROLL, is_foldable
-from swarmsim.runtime.scalar_program import Program, on_cpu
+from swarmsim.scalars.interpreter import UNROLL, is_foldable
+from swarmsim.scalars.program import Program, on_cpu
 
 Layout = Literal["scalars", "vmap"]
 LAYOUTS = ("scalars", "vmap")
@@ -45,7 +45,7 @@ def over_vehicles(
             Keyword arguments are mapped over axis 0. All results have the vehicles' axis in front.
         layout: ``scalars``, or ``vmap`` for `jax.vmap` itself.
         unroll: longest `jax.lax.scan` inside ``function`` that is written out; longer ones carry scalars.
-        platform: that the program will run on, by default JAX's own; see `swarmsim.runtime.scalar_program.on_cpu`.
+        platform: that the program will run on, by default JAX's own; see `swarmsim.scalars.program.on_cpu`.
 
     Raises:
         ValueError: for an unknown layout, or, when called, for arguments that do not fit ``in_axes``.

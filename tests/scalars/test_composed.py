@@ -13,9 +13,9 @@ from jax.sharding import AxisType, PartitionSpec
 from swarmsim.control.commands import PositionCommand
 from swarmsim.control.multirotor import control, control_start
 from swarmsim.physics.multirotor import make_multirotor_step
-from swarmsim.runtime.scalars import over_vehicles
+from swarmsim.scalars import over_vehicles
 from tests.flights import ENGINES, airborne, hover_speed, params_of, plane
-from tests.runtime.mapped import MISSIONS, PLATFORMS, RASTER, N, assert_alike, check, indices, numbers, on_gpu, x3
+from tests.scalars.mapped import MISSIONS, PLATFORMS, RASTER, N, assert_alike, check, indices, numbers, on_gpu, x3
 
 
 def test_keys():

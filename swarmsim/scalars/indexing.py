@@ -1,6 +1,6 @@
 """Reading and writing parts of small arrays: at constant indices, or else by selecting among all places.
 
-The arrays are those of `swarmsim.runtime.scalar_rules`.
+The arrays are those of `swarmsim.scalars.rules`.
 """
 
 import itertools
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jax import lax
 
-from swarmsim.runtime.scalar_graph import Graph, Operation, Scalar, is_constant
-from swarmsim.runtime.scalar_rules import (
+from swarmsim.scalars.graph import Graph, Operation, Scalar, is_constant
+from swarmsim.scalars.rules import (
     ADD,
     AND,
     EQ,

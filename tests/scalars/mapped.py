@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.runtime.scalars import over_vehicles
+from swarmsim.scalars import over_vehicles
 
 N = 5
 RASTER = np.random.default_rng(7).normal(size=(20, 30)).astype(np.float32)

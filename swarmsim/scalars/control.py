@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 from jax.extend import core
 
-from swarmsim.runtime.scalar_interpreter import (
+from swarmsim.scalars.interpreter import (
     CALLS,
     SMALL,
     Interpreter,
@@ -19,7 +19,7 @@ from swarmsim.runtime.scalar_interpreter import (
     is_number,
     is_small,
 )
-from swarmsim.runtime.scalar_rules import LE, NotWritableError, as_objects, pack, tidy, unpack
+from swarmsim.scalars.rules import LE, NotWritableError, as_objects, pack, tidy, unpack
 
 
 def _flow(jaxpr: Any, mapped: Sequence[bool]) -> list[bool]:
