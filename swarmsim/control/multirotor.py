@@ -145,7 +145,9 @@ def _acceleration(
     lift = jnp.maximum(wanted[2], lowest)
     level = _limited(wanted, jnp.stack([autopilot.tilt_max_tan * (GRAVITY_M_S2 + lift), reach]))
     given = jnp.stack([level[0], level[1], lift])
-    winding = (wanted - given) * error > 0.0  # the limit already cuts in the direction in which it would grow
+    # A limit already cuts in the direction in which it would grow: of the feedback too, or a vehicle far from its
+    # reference turns its integral with it and circles for ever.
+    winding = (feedback + memory.integral_m_s2 - given) * error > 0.0
     integral = memory.integral_m_s2 + jnp.where(winding, 0.0, autopilot.velocity_integral_1_s2 * dt * error)
     bounds = jnp.stack([autopilot.tilt_max_tan * GRAVITY_M_S2, reach])
     still = touching & (jnp.sum(body.velocity_m_s * body.velocity_m_s) < LANDED_SPEED_M_S**2)

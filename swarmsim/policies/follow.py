@@ -10,6 +10,7 @@ from swarmsim.pytree import pytree, static
 from swarmsim.site import sample
 
 START_SPEED_M_S = 0.3  # a reference at rest at the start of its path sets out at this speed
+PACE_M_S2 = 2.5  # the reference stops and sets out again with this, or the vehicle would overshoot it and fly back
 LAG_M = 1.0  # the reference waits for a vehicle that is further behind than this
 LANDING_PATH_M = 1.0  # within this rest of its path a vehicle that stands on the ground has landed
 LANDED_SPEED_M_S = 0.15
@@ -26,6 +27,7 @@ class Progress:
     """How far along its path a follower's reference is."""
 
     progress_m: jax.Array  # [] arc length
+    pace: jax.Array  # [] speed of the reference over that of the path
     lands: jax.Array  # [] bool: the path ends on the ground
 
 
@@ -40,7 +42,7 @@ class FollowByAir:
         assert task.path is not None
         end = task.path.points_m[-1]
         lands = end[2] < sample(task.site.terrain_m, task.site, end[:2]) + LANDS_BELOW_M
-        return Progress(progress_m=jnp.zeros(()), lands=lands)
+        return Progress(progress_m=jnp.zeros(()), pace=jnp.zeros(()), lands=lands)
 
     def act(self, task: Task, memory: Progress, view: View, key: jax.Array) -> tuple[Progress, PositionCommand]:
         """Position and velocity of the reference, displaced by what traffic asks for."""
@@ -49,7 +51,9 @@ class FollowByAir:
         here = reference(path, memory.progress_m, START_SPEED_M_S)
         offset = here.position_m - view.position_m
         lag = jnp.sqrt(jnp.sum(offset * offset) + 1e-12)
-        pace = jnp.where(view.hold, 0.0, jnp.clip(2.0 - lag / LAG_M, 0.0, 1.0))
+        allowed = jnp.where(view.hold, 0.0, jnp.clip(2.0 - lag / LAG_M, 0.0, 1.0))
+        change = PACE_M_S2 * self.control_period_s / jnp.maximum(here.speed_m_s, START_SPEED_M_S)
+        pace = memory.pace + jnp.clip(allowed - memory.pace, -change, change)
         progress = jnp.minimum(memory.progress_m + pace * here.speed_m_s * self.control_period_s, path.length_m)
         command = PositionCommand(
             position_m=here.position_m + view.push_m,
@@ -58,7 +62,7 @@ class FollowByAir:
             yaw_rad=task.yaw_rad,
             hold_position=jnp.ones(()),
         )
-        return Progress(progress_m=progress, lands=memory.lands), command
+        return Progress(progress_m=progress, pace=pace, lands=memory.lands), command
 
     def done(self, task: Task, memory: Progress, view: View) -> jax.Array:
         """Whether [] it has landed at the end of its path, or hovers there."""
@@ -76,7 +80,7 @@ class FollowByGround:
 
     def start(self, task: Task, key: jax.Array) -> Progress:
         """At the beginning of the path."""
-        return Progress(progress_m=jnp.zeros(()), lands=jnp.array(True))
+        return Progress(progress_m=jnp.zeros(()), pace=jnp.zeros(()), lands=jnp.array(True))
 
     def act(self, task: Task, memory: Progress, view: View, key: jax.Array) -> tuple[Progress, DriveToCommand]:
         """The pursued point; it moves on as fast as is needed, at most at three times the speed of the path."""
@@ -91,7 +95,7 @@ class FollowByGround:
         advance = pace * jnp.clip(lookahead - gap, 0.0, 3.0 * behind.speed_m_s * self.control_period_s)
         progress = jnp.minimum(memory.progress_m + advance, path.length_m)
         command = DriveToCommand(position_m=ahead.position_m[:2], speed_m_s=pace * behind.speed_m_s)
-        return Progress(progress_m=progress, lands=memory.lands), command
+        return Progress(progress_m=progress, pace=pace, lands=memory.lands), command
 
     def done(self, task: Task, memory: Progress, view: View) -> jax.Array:
         """Whether [] it stands at the end of its path."""

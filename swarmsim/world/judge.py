@@ -13,7 +13,7 @@ from swarmsim.world import events
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below
-from swarmsim.world.neighbours import right_of_way
+from swarmsim.world.neighbours import kept_aside, right_of_way
 from swarmsim.world.radio import broadcast
 from swarmsim.world.state import GroupState, Surroundings, WorldState
 
@@ -67,24 +67,28 @@ def _in_traffic(
     """Groups with what the other vehicles ask of each, which vehicles have collided [U], and the search's overflow."""
     flies = [jnp.full(group.size, KINDS[group.kind].FLIES) for group in world.groups]
     able = [g.active & events.able(g.event_time_s) for g in groups]
+    height, every = jnp.concatenate([g.around.height_m for g in groups]), jnp.concatenate(flies)
     traffic = right_of_way(
         jnp.concatenate([g.vehicle.body.position_m for g in groups]),
         jnp.concatenate([g.vehicle.body.velocity_m_s for g in groups]),
-        height_m=jnp.concatenate([g.around.height_m for g in groups]),
-        flies=jnp.concatenate(flies),
+        height_m=height,
+        flies=every,
         active=jnp.concatenate(able),
         rank=jnp.concatenate([group.member for group in world.groups]),
         radius_m=jnp.concatenate([group.limits.radius_m for group in world.groups]),
         half_height_m=jnp.concatenate([group.limits.half_height_m for group in world.groups]),
         separation_m=world.traffic.separation_m,
         ground_separation_m=world.traffic.ground_separation_m,
+        held=jnp.concatenate([g.around.hold for g in groups]),
     )
+    before = jnp.concatenate([g.around.push_m for g in groups])
+    separation, dt = world.traffic.separation_m, world.timing.judge_period_s
+    push, aside = kept_aside(before, traffic.push_m, height, every, separation, dt)
+    hold = traffic.hold | aside
     told, collided, first = [], [], 0
     for group, g in zip(world.groups, groups, strict=True):
         part = slice(first, first + group.size)
-        around = replace(
-            g.around, hold=traffic.hold[part], push_m=traffic.push_m[part], nearest_m=traffic.nearest_m[part]
-        )
+        around = replace(g.around, hold=hold[part], push_m=push[part], nearest_m=traffic.nearest_m[part])
         told.append(replace(g, around=around))
         collided.append(traffic.collided[part])
         first += group.size

@@ -19,6 +19,10 @@ SLOW_M_S = 0.1  # a slower multirotor near the ground counts as standing there
 SPEED_MAX_M_S = 15.0  # the look-ahead is complete up to this speed
 PUSH_FROM_M = 1.0  # height above ground where stepping aside sets in ...
 PUSH_FULL_M = 3.0  # ... and where it is complete
+ASIDE_S = 0.4  # time constant of stepping aside: see `kept_aside`
+BACK_S = 1.5  # time constant of coming back
+RELEASE = 1.5  # times the separation is what one that waits wants ahead of it
+HOLD_SHARE = 0.2  # of the separation: one pushed further than this waits until it has come back
 ENCOUNTERS = 8  # at most this many, the nearest, are stepped aside for at a time
 SIDE_SHARE = 0.1  # of the separation: bias to one side, which resolves an encounter head on
 CLIMB_SHARE = 0.3  # of the separation: bias up, or down where the other is above
@@ -74,6 +78,7 @@ class _Fleet:
     velocity_m_s: jax.Array  # [V, 3]
     precedence: jax.Array  # [V] int32: of two that meet the lower one goes first
     gap_m: jax.Array  # [V] separation from its kind
+    margin: jax.Array  # [V] on the separation, when looking ahead
     flies: jax.Array  # [V] bool
     active: jax.Array  # [V] bool
     roams: jax.Array  # [V] bool: active, and no multirotor that stands on the ground
@@ -148,6 +153,7 @@ def right_of_way(
     half_height_m: jax.Array,
     separation_m: jax.Array,
     ground_separation_m: jax.Array,
+    held: jax.Array | None = None,
     window: int = WINDOW,
     dense_max: int = DENSE_MAX,
 ) -> Traffic:
@@ -159,9 +165,10 @@ def right_of_way(
     deadlock. By rank alone a vehicle would take off below another that has just been pushed over its pad.
 
     Waiting. A vehicle holds while one that precedes it is closer than the separation, or will be within
-    ``LOOK_AHEAD_S`` at their present velocities. It may so pass in front where it is fast enough, and slows down to
-    pass behind where it is not. Without looking ahead two vehicles of 5 m/s meet 0.6 s after they come within 6 m of
-    each other, too late to give way.
+    ``LOOK_AHEAD_S``, whether that one goes on at its present velocity or stops where it is: nobody knows where another
+    turns. It may so pass in front where it is fast enough, slows down to pass behind where it is not, and keeps a
+    distance to one that it follows. Without looking ahead two vehicles of 5 m/s meet 0.6 s after they come within 6 m
+    of each other, too late to give way.
 
     Stepping aside. A multirotor in flight that holds moves its reference away from the point of closest approach by
     the missing separation: across the other's way, not along it, with a bias upwards (downwards where the other is
@@ -182,6 +189,8 @@ def right_of_way(
         radius_m, half_height_m: [V] m, collision cylinders.
         separation_m: [] m, between multirotors, 3-D.
         ground_separation_m: [] m, between rovers, 3-D.
+        held: [V] bool, which were told to wait before: they set out only where the look-ahead leaves `RELEASE` times
+            the separation, or they would set out into the way of what is about to pass. None: nobody.
         window, dense_max: see `neighbours`.
 
     Returns:
@@ -200,6 +209,7 @@ def right_of_way(
         velocity_m_s=velocity,
         precedence=(rank + jnp.where(flying, 0, _RANKS)).astype(jnp.int32),
         gap_m=jnp.where(flies, separation_m, ground_separation_m),
+        margin=jnp.ones_like(radius_m) if held is None else jnp.where(held, RELEASE, 1.0),
         flies=flies,
         active=moving,
         roams=moving & (flying | ~flies | (pace > SLOW_M_S)),
@@ -228,6 +238,30 @@ def right_of_way(
         nearest_m=nearest,
         overflow=overflow,
     )
+
+
+def kept_aside(
+    push_m: jax.Array, wanted_m: jax.Array, height_m: jax.Array, flies: jax.Array, separation_m: jax.Array, dt: float
+) -> tuple[jax.Array, jax.Array]:
+    """The push that vehicles are given, from the push given before and the one that `right_of_way` wants now.
+
+    What is wanted falls as a vehicle steps aside, to nothing where it is aside: obeyed at once it would lead the
+    vehicle back into the other's way, over and over. A leaky integral holds it aside until the other has passed: it
+    comes to rest with ``BACK_S / (BACK_S + ASIDE_S)`` of the separation in place of one half, and then comes back
+    within ``BACK_S``.
+
+    Args:
+        push_m: [V, 3] m, given at the last judgement.
+        wanted_m: [V, 3] m, of `right_of_way`.
+        height_m, flies, separation_m: as of `right_of_way`.
+        dt: time between two judgements, s.
+
+    Returns:
+        Push [V, 3], and which vehicles [V] are so far aside that they wait.
+    """
+    push = push_m * jnp.exp(-dt / BACK_S) + (dt / ASIDE_S) * wanted_m
+    push = _limited(push, jnp.where(jnp.isfinite(height_m), height_m, 0.0), flies, separation_m)
+    return push, jnp.sum(push * push, axis=-1) > (HOLD_SHARE * separation_m) ** 2
 
 
 def _contacts(fleet: _Fleet, candidates: _Candidates) -> tuple[jax.Array, jax.Array]:
@@ -263,8 +297,11 @@ def _yields(fleet: _Fleet, candidates: _Candidates, close: bool, coming: bool) -
     square = jnp.sum(apart * apart, axis=-1)
     found = (square < gap) if close else jnp.zeros_like(precedes)
     if coming:
-        later = _closest(apart, other[..., 5:] - mine[..., 5:])
-        found |= candidates.of(fleet.roams) & (square >= gap) & (jnp.sum(later * later, axis=-1) < gap)
+        both = _closest(apart, other[..., 5:] - mine[..., 5:])  # the other flies on ...
+        alone = _closest(apart, -mine[..., 5:])  # ... or stops, as at a corner of its path
+        room = gap * fleet.margin[:, None] ** 2
+        meets = (jnp.sum(both * both, axis=-1) < room) | (jnp.sum(alone * alone, axis=-1) < room)
+        found |= candidates.of(fleet.roams) & (square >= gap) & meets
     score = jnp.where(precedes & found, -square, -jnp.inf)
     if score.shape[1] <= ENCOUNTERS:
         slot = jnp.broadcast_to(jnp.arange(score.shape[1]), score.shape)
