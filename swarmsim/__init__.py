@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from swarmsim.runtime.run import build, run
     from swarmsim.runtime.simulation import MissionBatch, Simulation
     from swarmsim.world.model import World
-    from swarmsim.world.state import WorldState
+    from swarmsim.world.state import WorldState, mission_axes
     from swarmsim.world.step import hold, reset, step
 
 _HOMES = {
@@ -78,6 +78,7 @@ _HOMES = {
     "runtime.simulation": ("MissionBatch", "Simulation"),
     "world.model": ("World",),
     "world.state": ("WorldState",),
+    "world.state": ("mission_axes",),
     "world.step": ("hold", "reset", "step"),
 }
 _SHORTER = {"load_scenario": "load", "register": "register_policy"}
@@ -106,6 +107,7 @@ __all__ = [
     "go_to",
     "hold",
     "load",
+    "mission_axes",
     "mission_record",
     "observe",
     "record_steps",

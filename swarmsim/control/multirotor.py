@@ -26,8 +26,6 @@ LANDED_DESCENT_M_S = 0.2
 LANDED_SPEED_M_S = 0.15
 """Maximum speed for landing detection."""
 
-Setpoint = PositionCommand
-
 
 @pytree
 class ControlMemory:

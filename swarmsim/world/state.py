@@ -67,5 +67,14 @@ class WorldState:
     crowded: jax.Array  # [] bool: more vehicles in one place than the neighbour search can hold, at any time
 
 
+def mission_axes() -> WorldState:
+    """Axes of `jax.vmap` over missions (axis 0 of every state) that share their clock, as ``in_axes`` and ``out_axes``.
+
+    What is due at a period, a sample or a look at the traffic, is then done at its period; with a clock of its own each
+    mission does all of it at every tick, because a condition that differs by mission evaluates both branches.
+    """
+    return WorldState(clock=None, key=0, groups=0, radio=0, crowded=0)  # type: ignore[arg-type]
+
+
 Readings = tuple[Reading | None, ...]
 """For each group what its detectors read; None for a group without."""

@@ -51,7 +51,7 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
         height_m=jnp.zeros(size),
         hold=jnp.zeros(size, bool),
         push_m=jnp.zeros((size, 3)),
-        nearest_m=jnp.full(size, jnp.inf),
+        nearest_m=jnp.full(size, jnp.inf, jnp.float32),
     )
     memory = kind.control_start()
     return GroupState(

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmsim.control.multirotor import LANDED_AFTER_S, Setpoint, rotor_commands
+from swarmsim.control.commands import PositionCommand
+from swarmsim.control.multirotor import LANDED_AFTER_S, rotor_commands
 from swarmsim.vehicles.multirotor import effectiveness
 from tests.flights import airborne, attitude, fly_controlled, hover_speed, params_of, plane, spec_of
 
@@ -51,7 +52,7 @@ def survey_line(time):
     zero = 0.0 * time
     up = jnp.clip(2 * time, 0.0, 20.0)
     east = jnp.where(run < 2.5, 0.5 * run**2, 2.5 * run - 3.125)
-    return Setpoint(
+    return PositionCommand(
         position_m=jnp.stack([east, zero, up + FOOT]),
         velocity_m_s=jnp.stack([jnp.minimum(run, 2.5), zero, jnp.where(time < 10.0, 2.0, 0.0)]),
         acceleration_m_s2=jnp.stack([jnp.where((run > 0) & (run < 2.5), 1.0, 0.0), zero, zero]),
@@ -76,7 +77,7 @@ def test_tracks_a_survey_line_in_gusts(name, wind, mass):
 def landing(time):
     """Down from 3 m at 0.5 m/s, on into the ground."""
     zero = 0.0 * time
-    return Setpoint(
+    return PositionCommand(
         position_m=jnp.stack([zero, zero, jnp.maximum(3.0 - 0.5 * time, -1.0)]),
         velocity_m_s=jnp.stack([zero, zero, jnp.where(time < 8.0, -0.5, 0.0)]),
         acceleration_m_s2=jnp.zeros(3),
@@ -114,7 +115,7 @@ def hop(time):
     down, up = 1.0 - 0.5 * time, -0.5 + 1.0 * (time - 6.0)
     high = jnp.where(time < 6.0, jnp.maximum(down, -0.5), jnp.minimum(up, 2.0))
     climb = jnp.where(time < 3.0, -0.5, jnp.where((time > 6.0) & (up < 2.0), 1.0, 0.0))
-    return Setpoint(
+    return PositionCommand(
         position_m=jnp.stack([zero, zero, high]),
         velocity_m_s=jnp.stack([zero, zero, climb]),
         acceleration_m_s2=jnp.zeros(3),
@@ -132,7 +133,7 @@ def test_takes_off_again_after_landing():
 
 def turn(time):
     zero = 0.0 * time
-    return Setpoint(
+    return PositionCommand(
         position_m=jnp.stack([zero, zero, zero + 30.0]),
         velocity_m_s=jnp.zeros(3),
         acceleration_m_s2=jnp.zeros(3),

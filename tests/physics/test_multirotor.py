@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmsim.config.errors import InputError
-from swarmsim.control.multirotor import Setpoint
+from swarmsim.control.commands import PositionCommand
 from swarmsim.physics.multirotor import check_time_step, longest_time_step, make_multirotor_step, step_loads
 from swarmsim.vehicles.multirotor import multirotor_mjcf
 from tests.flights import (
@@ -141,7 +141,7 @@ def _turning_flight(time):
     """Figure of eight with a climb and a yaw: every axis moves."""
     a, w = 4.0, 0.8
     zero = 0.0 * time
-    return Setpoint(
+    return PositionCommand(
         position_m=jnp.stack([a * jnp.sin(w * time), a * jnp.sin(2 * w * time) / 2, 50.0 + jnp.sin(w * time)]),
         velocity_m_s=w * jnp.stack([a * jnp.cos(w * time), a * jnp.cos(2 * w * time), jnp.cos(w * time)]),
         acceleration_m_s2=jnp.stack([zero, zero, zero]),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from swarmsim.control.commands import go_to
+from swarmsim.world.state import mission_axes
 from swarmsim.world.step import step
 from tests.world.worlds import at_tick, begin, row, world
 
@@ -102,7 +103,7 @@ def test_a_batch_of_missions_at_different_ticks_equals_its_missions(fields, begu
 def test_a_batch_of_missions_that_share_their_clock_equals_its_missions(fields, begun, commands):
     shared = begun[1].clock
     begun = [replace(state, clock=shared) for state in begun]
-    axes = replace(jax.tree.map(lambda _: 0, begun[0]), clock=None)
+    axes = mission_axes()
     together = jax.vmap(scanned, in_axes=(0, axes, None), out_axes=(axes, 0))
     state, (reading,) = jax.jit(together)(stacked(fields), replace(stacked(begun), clock=shared), commands)
     assert int(state.clock.tick) == STARTS[1] + TICKS
