@@ -77,8 +77,7 @@ _HOMES = {
     "runtime.run": ("build", "run"),
     "runtime.simulation": ("MissionBatch", "Simulation"),
     "world.model": ("World",),
-    "world.state": ("WorldState",),
-    "world.state": ("mission_axes",),
+    "world.state": ("WorldState", "mission_axes"),
     "world.step": ("hold", "reset", "step"),
 }
 _SHORTER = {"load_scenario": "load", "register": "register_policy"}
