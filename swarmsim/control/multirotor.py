@@ -143,9 +143,10 @@ def _acceleration(
     lift = jnp.maximum(wanted[2], lowest)
     level = _limited(wanted, jnp.stack([autopilot.tilt_max_tan * (GRAVITY_M_S2 + lift), reach]))
     given = jnp.stack([level[0], level[1], lift])
-    # A limit already cuts in the direction in which it would grow: of the feedback too, or a vehicle far from its
+    # It stands still where it would grow and a limit cuts already: that of the feedback too, or a vehicle far from its
     # reference turns its integral with it and circles for ever.
-    winding = (feedback + memory.integral_m_s2 - given) * error > 0.0
+    cut = (feedback + memory.integral_m_s2 - given) * error > 0.0
+    winding = cut & (memory.integral_m_s2 * error >= 0.0)
     integral = memory.integral_m_s2 + jnp.where(winding, 0.0, autopilot.velocity_integral_1_s2 * dt * error)
     bounds = jnp.stack([autopilot.tilt_max_tan * GRAVITY_M_S2, reach])
     still = touching & (jnp.sum(body.velocity_m_s * body.velocity_m_s) < LANDED_SPEED_M_S**2)

@@ -96,7 +96,7 @@ class ParallelLinesPlanner:
         across the lines, so that their ways do not cross. Every UAV flies its part in the order and direction with the
         least transit.
         """
-        start, end, used = _pieces(*_cut_lines(task), task.bands, task.line_spacing_m)
+        start, end, used = _pieces(*_cut_lines(task), task.bands)
         share = _share(start, end, used, task.home_m.shape[0])
         rank = _places_in_order(task, situation.position_m[:, :2])
 
@@ -129,21 +129,11 @@ def _cut_lines(task: SurveyTask) -> tuple[jax.Array, jax.Array, jax.Array]:
     return low[:, None] * along + offset, high[:, None] * along + offset, used
 
 
-def _pieces(
-    start: jax.Array, end: jax.Array, used: jax.Array, bands: int, line_spacing_m: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Lines [L, 2] cut into ``bands`` equal pieces [bands L, 2] each: the first pieces of all, then the second ones.
-
-    Between two pieces of a line is left as much as between two lines, at most half a piece: two vehicles that turn
-    there never meet, and what lies between is seen from both sides as well as what lies between lines.
-    """
-    length = jnp.sqrt(jnp.sum((end - start) ** 2, axis=-1, keepdims=True) + 1e-12)
-    gap = jnp.minimum(line_spacing_m / length, 0.5 / bands)
+def _pieces(start: jax.Array, end: jax.Array, used: jax.Array, bands: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Lines [L, 2] cut into ``bands`` equal pieces [bands L, 2] each: the first pieces of all, then the second ones."""
     edge = jnp.linspace(0.0, 1.0, bands + 1)[:, None, None]
-    first = jnp.where(edge[:-1] > 0.0, edge[:-1] + 0.5 * gap, 0.0)
-    last = jnp.where(edge[1:] < 1.0, edge[1:] - 0.5 * gap, 1.0)
-    way = end - start
-    return (start + first * way).reshape(-1, 2), (start + last * way).reshape(-1, 2), jnp.tile(used, bands)
+    cut = start + edge * (end - start)
+    return cut[:-1].reshape(-1, 2), cut[1:].reshape(-1, 2), jnp.tile(used, bands)
 
 
 def _places_in_order(task: SurveyTask, position_m: jax.Array) -> jax.Array:

@@ -159,3 +159,13 @@ def test_recovers_from_upside_down(name):
     states, _, _ = fly_controlled(params, turn, 12.0, state=start, name=name)
     assert states.body.position_m[:, 2].min() > 10.0
     np.testing.assert_allclose(states.body.position_m[-1], [0, 0, 30.0], atol=0.3)
+
+
+@pytest.mark.parametrize("name", ["tarot_t650", "x500"])
+def test_one_that_circles_its_place_comes_to_it(name):
+    # with an integral that winds up while the feedback is at its limit, this circle of 8 m goes on for ever
+    params = params_of(name)
+    start = airborne(params, height=30.0, speed=hover_speed(params))
+    body = replace(start.body, position_m=jnp.array([8.0, 0.0, 30.0]), velocity_m_s=jnp.array([0.0, 7.5, 0.0]))
+    states, _, _ = fly_controlled(params, turn, 20.0, state=replace(start, body=body), name=name)
+    np.testing.assert_allclose(states.body.position_m[-1], [0, 0, 30.0], atol=0.1)

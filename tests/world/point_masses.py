@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim.policies.follow import PACE_M_S2
 from swarmsim.pytree import pytree
-from swarmsim.world.neighbours import right_of_way
+from swarmsim.world.neighbours import kept_aside, right_of_way
 
 RADIUS_M, HALF_HEIGHT_M, SEPARATION_M = 0.515, 0.15, 6.0  # of a Tarot T650
 GROUND_SEPARATION_M = 2.0
@@ -43,8 +44,8 @@ class Flown:
 def flown(way, speed):
     """Flight of point masses along ways [V, N, 3] at speeds [N - 1]; vehicles of non-finite ways do not exist.
 
-    A vehicle follows a reference that waits for traffic and for a vehicle that lags behind, by position and velocity
-    control with the gains, the acceleration and the climb of a small multirotor.
+    A vehicle follows a reference that waits for traffic and for a vehicle that lags behind, as the world and its
+    follower do, by position and velocity control with the gains, the acceleration and the climb of a small multirotor.
     """
     count = way.shape[0]
     leg = jnp.linalg.norm(jnp.diff(way, axis=1), axis=-1)
@@ -64,14 +65,17 @@ def flown(way, speed):
         return v * jnp.minimum(1.0, limit / jnp.maximum(jnp.linalg.norm(v, axis=-1, keepdims=True), 1e-6))
 
     def tick(carry):
-        number, p, v, progress, flown = carry
-        active = exists & ~flown.landed
-        rules = traffic(p, v, height_m=p[:, 2] - HALF_HEIGHT_M, active=active)
+        number, p, v, progress, go, push, hold, flown = carry
+        active, height = exists & ~flown.landed, p[:, 2] - HALF_HEIGHT_M
+        rules = traffic(p, v, height_m=height, active=active, held=hold)
+        push, aside = kept_aside(push, rules.push_m, height, jnp.ones(count, bool), jnp.float32(SEPARATION_M), DT_S)
+        hold = rules.hold | aside
         here, velocity, pace = reference(progress)
         lag = jnp.linalg.norm(here - p, axis=-1)
-        go = jnp.where(rules.hold, 0.0, jnp.clip(2.0 - lag, 0.0, 1.0))
+        change = PACE_M_S2 * DT_S / jnp.maximum(pace, 0.3)
+        go = go + jnp.clip(jnp.where(hold, 0.0, jnp.clip(2.0 - lag, 0.0, 1.0)) - go, -change, change)
         for _ in range(4):
-            wanted = shortened(1.2 * (here + rules.push_m - p), 8.0) + go[:, None] * velocity
+            wanted = shortened(1.2 * (here + push - p), 8.0) + go[:, None] * velocity
             v = jnp.where(active[:, None], v + shortened(2.8 * (wanted - v), 4.0) * DT_S / 4, 0.0)
             p = p + v * DT_S / 4
             stands = p[:, 2] < HALF_HEIGHT_M
@@ -84,13 +88,13 @@ def flown(way, speed):
             collided=flown.collided | rules.collided,
             nearest_m=jnp.minimum(flown.nearest_m, jnp.where(active, rules.nearest_m, jnp.inf)),
         )
-        return number + 1, p, v, progress, flown
+        return number + 1, p, v, progress, go, push, hold, flown
 
-    no = jnp.zeros(count, bool)
+    no, still = jnp.zeros(count, bool), jnp.zeros((count, 3))
     start = Flown(time_s=jnp.float32(0.0), landed=no, collided=no, nearest_m=jnp.full(count, jnp.inf))
-    begin = (jnp.int32(0), way[:, 0], jnp.zeros((count, 3)), jnp.zeros(count), start)
-    under_way = lambda c: (c[0] < 8000) & jnp.any(exists & ~c[4].landed)  # noqa: E731
-    return jax.lax.while_loop(under_way, tick, begin)[4]
+    begin = (jnp.int32(0), way[:, 0], still, jnp.zeros(count), jnp.zeros(count), still, no, start)
+    under_way = lambda c: (c[0] < 8000) & jnp.any(exists & ~c[-1].landed)  # noqa: E731
+    return jax.lax.while_loop(under_way, tick, begin)[-1]
 
 
 def tour(pads, *stops):

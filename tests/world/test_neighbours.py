@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from swarmsim.world.neighbours import PUSH_FROM_M, Traffic, neighbours
+from swarmsim.world.neighbours import ASIDE_S, BACK_S, PUSH_FROM_M, Traffic, kept_aside, neighbours
 from tests.world.point_masses import HALF_HEIGHT_M, RADIUS_M, SEPARATION_M, flown, random_tour, speeds, tour, traffic
 
 nearby = jax.jit(neighbours, static_argnames=("count", "window", "dense_max"))
@@ -204,9 +204,42 @@ def test_one_that_closes_in_waits_before_the_separation_is_lost():
     apart = [[0.0, 0.0, 20.0], [14.0, 0.0, 20.0]]
     assert holds(apart, [[0.0, 0.0, 0.0], [-5.0, 0.0, 0.0]]) == [False, True]
     assert holds(apart, [[5.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) == [False, True]
-    assert holds(apart, [[-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]]) == [False, False]  # behind it, as fast
+    assert holds(apart, [[-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]]) == [False, True]  # behind it: it may stop
+    further = [[0.0, 0.0, 20.0], [16.5, 0.0, 20.0]]
+    assert holds(further, [[-5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]]) == [False, False]
     assert holds(apart, [[0.0, 5.0, 0.0], [0.0, 5.0, 0.0]]) == [False, False]  # on parallel lines
     assert holds(apart, [[5.0, 0.0, 0.0], [0.0, 8.0, 0.0]]) == [False, False]  # out of its way in time
+
+
+def test_one_that_waits_sets_out_only_where_there_is_room():
+    passing = [[0.0, 0.0, 20.0], [20.0, 7.0, 20.0]]  # the second stands a separation and a metre aside of the first
+    velocity = [[10.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    assert holds(passing, velocity) == [False, False]
+    assert holds(passing, velocity, held=[False, True]) == [False, True]
+    aside = [[0.0, 0.0, 20.0], [20.0, 9.1, 20.0]]
+    assert holds(aside, velocity, held=[False, True]) == [False, False]
+
+
+def test_one_that_stepped_aside_stays_there_until_the_other_has_passed():
+    dt, gap = 0.05, 3.0
+    high, flies = jnp.array([20.0]), jnp.array([True])
+
+    def step(push, wanted):
+        return kept_aside(push, jnp.array([[wanted, 0.0, 0.0]]), high, flies, jnp.float32(gap), dt)
+
+    push = jnp.zeros((1, 3))
+    for _ in range(200):  # it does what it is told, and what is still missing is wanted
+        push, waits = step(push, max(gap - float(push[0, 0]), 0.0))
+    assert float(push[0, 0]) == pytest.approx(gap * BACK_S / (BACK_S + ASIDE_S), rel=0.01)
+    assert bool(waits[0])
+    for _ in range(30):
+        push, waits = step(push, 0.0)
+    assert float(push[0, 0]) == pytest.approx(gap * BACK_S / (BACK_S + ASIDE_S) * np.exp(-30 * dt / BACK_S), rel=0.01)
+    for _ in range(60):
+        push, waits = step(push, 0.0)
+    assert not bool(waits[0])
+    low = kept_aside(jnp.full((1, 3), 2.0), jnp.zeros((1, 3)), jnp.array([0.5]), flies, jnp.float32(gap), dt)[0]
+    assert np.all(low == 0.0)
 
 
 def test_the_push_is_across_the_way_of_the_other():
