@@ -21,6 +21,8 @@ LANDED_AFTER_S = 0.4
 """How long the ground must stop a commanded descent before the vehicle counts as landed."""
 LANDED_LOAD = 0.02
 """Load on the landing gear, over the weight, from which it feels the ground."""
+SOFT_M_S2 = 0.2
+"""Acceleration beyond a limit at which the integral grows half as fast."""
 LANDED_DESCENT_M_S = 0.2
 """Minimum commanded descent rate for landing detection."""
 LANDED_SPEED_M_S = 0.15
@@ -143,11 +145,14 @@ def _acceleration(
     lift = jnp.maximum(wanted[2], lowest)
     level = _limited(wanted, jnp.stack([autopilot.tilt_max_tan * (GRAVITY_M_S2 + lift), reach]))
     given = jnp.stack([level[0], level[1], lift])
-    # It stands still where it would grow and a limit cuts already: that of the feedback too, or a vehicle far from its
-    # reference turns its integral with it and circles for ever.
-    cut = (feedback + memory.integral_m_s2 - given) * error > 0.0
-    winding = cut & (memory.integral_m_s2 * error >= 0.0)
-    integral = memory.integral_m_s2 + jnp.where(winding, 0.0, autopilot.velocity_integral_1_s2 * dt * error)
+    # The integral stands still where it would grow and a limit cuts already: that of the feedback too, or a vehicle far
+    # from its reference turns its integral with it and circles for ever. The passage is smooth, for the derivatives.
+    sign = jnp.sign(error)
+    excess = jnp.maximum((feedback + memory.integral_m_s2 - given) * sign, 0.0) / SOFT_M_S2
+    free = 1.0 / (1.0 + excess * excess)
+    unwinding = jnp.clip(-memory.integral_m_s2 * sign / SOFT_M_S2, 0.0, 1.0)
+    growth = (free + (1.0 - free) * unwinding) * error
+    integral = memory.integral_m_s2 + autopilot.velocity_integral_1_s2 * dt * growth
     bounds = jnp.stack([autopilot.tilt_max_tan * GRAVITY_M_S2, reach])
     still = touching & (jnp.sum(body.velocity_m_s * body.velocity_m_s) < LANDED_SPEED_M_S**2)
     return given, ControlMemory(
