@@ -13,8 +13,8 @@ from swarmsim.world import events
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below
-from swarmsim.world.neighbours import kept_aside, right_of_way
 from swarmsim.world.radio import broadcast
+from swarmsim.world.right_of_way import kept_aside, right_of_way
 from swarmsim.world.state import GroupState, Surroundings, WorldState
 
 

@@ -6,13 +6,19 @@ import numpy as np
 
 from swarmsim.policies.follow import PACE_M_S2
 from swarmsim.pytree import pytree
-from swarmsim.world.neighbours import kept_aside, right_of_way
+from swarmsim.world.right_of_way import kept_aside, right_of_way
 
 RADIUS_M, HALF_HEIGHT_M, SEPARATION_M = 0.515, 0.15, 6.0  # of a Tarot T650
 GROUND_SEPARATION_M = 2.0
 ALTITUDE_M = 20.0
 DT_S = 0.1
+ALL_PAIRS = 10_000
 _right_of_way = jax.jit(right_of_way, static_argnames=("window", "dense_max"))
+
+
+def cloud(seed, count, per_vehicle_m2=900.0, depth=20.0):
+    side = np.sqrt(count * per_vehicle_m2)
+    return np.random.default_rng(seed).uniform(0.0, [side, side, depth], (count, 3)).astype(np.float32)
 
 
 def traffic(position, velocity=None, **changes):
