@@ -1,4 +1,4 @@
-"""Policies in the loop: views of the vehicles, calls of their policies, and the commands of every group."""
+"""What the policies of a mission are given: views of the vehicles, their tasks, and keys."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,10 +16,11 @@ from swarmsim.missions.state import MissionState, PhaseState
 from swarmsim.policies.follow import FollowByAir, FollowByGround
 from swarmsim.policies.view import Belief, Task, View
 from swarmsim.scalars import over_vehicles
+from swarmsim.sensors.radiation import Reading
 from swarmsim.world.kinds import KINDS
-from swarmsim.world.model import World
-from swarmsim.world.radio import heard
-from swarmsim.world.state import WorldState
+from swarmsim.world.model import Group, World
+from swarmsim.world.radio import Heard, heard
+from swarmsim.world.state import GroupState, WorldState
 
 
 def policy_of(world: World, phase: Phase) -> Any:
@@ -45,32 +46,57 @@ def rows(tree: Any, indices: Sequence[int], axis: int = 0) -> Any:
     return jax.tree.map(lambda x: jnp.take(x, index, axis=axis), tree)
 
 
+def set_rows(tree: Any, indices: Sequence[int], values: Any) -> Any:
+    """Every array with its rows ``indices`` replaced by those of ``values``."""
+    leaves = jax.tree.leaves(tree)
+    if leaves and tuple(indices) == tuple(range(leaves[0].shape[0])):
+        return values
+    index = np.asarray(indices)
+    return jax.tree.map(lambda x, v: x.at[index].set(v), tree, values)
+
+
+def view_of(
+    group: Group, params: Any, battery_j: jax.Array, g: GroupState, reading: Reading | None, told: Heard | None
+) -> View:
+    """What one vehicle knows, but for the time and the team's belief; arguments are its rows of the group's."""
+    body, around = g.vehicle.body, g.around
+    return View(
+        time_s=None,  # type: ignore[arg-type]
+        position_m=body.position_m,
+        quaternion=body.quaternion,
+        velocity_m_s=body.velocity_m_s,
+        angular_velocity_rad_s=body.angular_velocity_rad_s,
+        battery=1.0 - g.vehicle.energy_j / battery_j,
+        height_m=KINDS[group.kind].height(params, g.vehicle, around.ground),
+        hold=around.hold,
+        push_m=around.push_m,
+        nearest_m=around.nearest_m,
+        reading=reading,
+        heard=told,
+        belief=None,
+    )
+
+
+def shared_belief(plan: Plan, belief: Any) -> Belief | None:
+    """The team's belief as policies see it."""
+    return None if belief is None or plan.mapping is None else Belief(params=plan.mapping, binned=belief)
+
+
+def heard_by(world: World, state: WorldState, number: int) -> Heard | None:
+    """What the vehicles [U] of a group heard."""
+    first = sum(group.size for group in world.groups[:number])
+    return heard(world, state.radio, first, world.groups[number].size)
+
+
 def views(world: World, plan: Plan, state: WorldState, belief: Any) -> tuple[View, ...]:
     """What the vehicles of each group know; leading axis U on all but the time and the belief."""
     now = state.clock.tick * jnp.float32(world.timing.control_period_s)
-    shared = None if belief is None or plan.mapping is None else Belief(params=plan.mapping, binned=belief)
-    made, first = [], 0
-    for group, g in zip(world.groups, state.groups, strict=True):
-        kind = KINDS[group.kind]
-        body, around = g.vehicle.body, g.around
-        made.append(
-            View(
-                time_s=now,
-                position_m=body.position_m,
-                quaternion=body.quaternion,
-                velocity_m_s=body.velocity_m_s,
-                angular_velocity_rad_s=body.angular_velocity_rad_s,
-                battery=1.0 - g.vehicle.energy_j / group.limits.battery_j,
-                height_m=jax.vmap(kind.height)(group.params, g.vehicle, around.ground),
-                hold=around.hold,
-                push_m=around.push_m,
-                nearest_m=around.nearest_m,
-                reading=None if g.counter is None else g.counter.reading,
-                heard=heard(world, state.radio, first, group.size),
-                belief=shared,
-            )
-        )
-        first += group.size
+    shared, made = shared_belief(plan, belief), []
+    for number, (group, g) in enumerate(zip(world.groups, state.groups, strict=True)):
+        reading, seen = None if g.counter is None else g.counter.reading, replace(g, counter=None)
+        told = heard_by(world, state, number)
+        own = jax.vmap(partial(view_of, group))(group.params, group.limits.battery_j, seen, reading, told)
+        made.append(replace(own, time_s=now, belief=shared))
     return tuple(made)
 
 
@@ -88,6 +114,12 @@ TASK_AXES = _axes(Task)
 """Which parts of a phase's tasks are each vehicle's own."""
 
 
+def view_rows(view: View, local: Sequence[int]) -> View:
+    """The views of some vehicles of a group."""
+    own = replace(view, time_s=None, belief=None)  # type: ignore[arg-type]
+    return replace(rows(own, local), time_s=view.time_s, belief=view.belief)
+
+
 def tasks(world: World, plan: Plan, phase: Phase, place: Place, path: Any) -> Task:
     """Tasks of a phase's vehicles in one group; axes as `TASK_AXES`."""
     return Task(
@@ -101,102 +133,74 @@ def tasks(world: World, plan: Plan, phase: Phase, place: Place, path: Any) -> Ta
     )
 
 
+def phase_key(phase: Phase, key: jax.Array) -> jax.Array:
+    """Key of a phase's policy in a mission."""
+    return randomness.consumer(key, f"policy {phase.name}")
+
+
 def phase_keys(world: World, phase: Phase, place: Place, key: jax.Array, number: jax.Array) -> jax.Array:
     """Keys [m] of a phase's vehicles in one group, at one occasion."""
     member = jnp.asarray(world.groups[place.group].member)[np.asarray(place.local)]
-    return randomness.per_vehicle(randomness.consumer(key, f"policy {phase.name}"), number, member)
+    return randomness.per_vehicle(phase_key(phase, key), number, member)
 
 
-def act(
-    world: World, plan: Plan, mission: MissionState, seen: tuple[View, ...]
-) -> tuple[tuple[PhaseState, ...], tuple[Any, ...]]:
-    """Phases after their policies were called, where it is time, and the commands of every group."""
-    tick = mission.world.clock.tick
-    phases: list[PhaseState] = []
-    given: list[list[tuple[jax.Array, Any]]] = [[] for _ in world.groups]
+def at_frames(world: World, policy: Any) -> bool:
+    """Whether a policy is called at the beginning of judging periods only, and not between control periods."""
+    period = period_ticks(world, policy)
+    return period > 1 and period % world.timing.judge_ticks == 0
+
+
+def ask(world: World, plan: Plan, mission: MissionState) -> tuple[PhaseState, ...]:
+    """Phases after the policies that are called at the beginning of judging periods were, where it is time."""
+    if not any(at_frames(world, policy_of(world, phase)) for phase in plan.phases):
+        return mission.phases
+    tick, phases = mission.world.clock.tick, []
+    seen = views(world, plan, mission.world, mission.belief)
     for number, (phase, state) in enumerate(zip(plan.phases, mission.phases, strict=True)):
         policy = policy_of(world, phase)
-        call = partial(_call, world, plan, phase, policy, number, mission, seen)
-        period = period_ticks(world, policy)
-        if state.held is None:
-            memory, commands = call(state)
-        else:
-            held = state.held
-            memory, commands = jax.lax.cond(tick % period == 0, call, lambda s, held=held: (s.memory, held), state)
-            state = replace(state, held=commands)
-        phases.append(replace(state, memory=memory))
-        for place, command in zip(phase.places, commands, strict=True):
-            follows = mission.phase_of[place.group] == number
-            given[place.group].append((follows, _placed(world, place, command)))
-    chosen = tuple(_chosen(world, i, mission.world, each) for i, each in enumerate(given))
-    return tuple(phases), chosen
+        if at_frames(world, policy):
+            call = partial(_call, world, plan, number, policy, mission, seen)
+            due = tick % period_ticks(world, policy) == 0
+            memory, held = jax.lax.cond(due, call, lambda s: (s.memory, s.held), state)
+            state = replace(state, memory=memory, held=held)
+        phases.append(state)
+    return tuple(phases)
 
 
 def _call(
-    world: World, plan: Plan, phase: Phase, policy: Any, number: int, mission: MissionState, seen: tuple[View, ...],
-    state: PhaseState,
-) -> tuple[Any, tuple[Any, ...]]:  # fmt: skip
+    world: World, plan: Plan, number: int, policy: Any, mission: MissionState, seen: tuple[View, ...], state: PhaseState
+) -> tuple[Any, tuple[Any, ...]]:
     """Memory [M] and commands (for each place) of a phase's vehicles after a call of the policy."""
-    memory, commands = state.memory, []
+    phase, memory, commands = plan.phases[number], state.memory, []
     for place in phase.places:
         task = tasks(world, plan, phase, place, state.path)
-        view = _rows_of_view(seen[place.group], place.local)
+        view = view_rows(seen[place.group], place.local)
         mine = rows(memory, place.rank)
         keys = phase_keys(world, phase, place, mission.world.key, mission.world.clock.tick)
         act = over_vehicles(policy.act, in_axes=(TASK_AXES, 0, VIEW_AXES, 0), layout=world.layout)
         after, command = act(task, mine, view, keys)
         inside = rows(mission.phase_of[place.group], place.local) == number
-        kept = jax.tree.map(partial(_where, inside), after, mine)
-        memory = _set_rows(memory, place.rank, kept)
+        memory = set_rows(memory, place.rank, jax.tree.map(partial(_where, inside), after, mine))
         commands.append(command)
     return memory, tuple(commands)
-
-
-def _rows_of_view(view: View, local: Sequence[int]) -> View:
-    own = replace(view, time_s=None, belief=None)  # type: ignore[arg-type]
-    return replace(rows(own, local), time_s=view.time_s, belief=view.belief)
 
 
 def _where(mask: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
     return jnp.where(mask.reshape(mask.shape + (1,) * (new.ndim - 1)), new, old)
 
 
-def _set_rows(tree: Any, indices: Sequence[int], values: Any) -> Any:
-    leaves = jax.tree.leaves(tree)
-    if leaves and tuple(indices) == tuple(range(leaves[0].shape[0])):
-        return values
-    index = np.asarray(indices)
-    return jax.tree.map(lambda x, v: x.at[index].set(v), tree, values)
+def chosen(group: Group, params: Any, vehicle: Any, given: Sequence[tuple[jax.Array, Any]]) -> Any:
+    """Full command of one vehicle: that of the phase that it is in; one in no phase stays where it is.
 
-
-def _placed(world: World, place: Place, command: Any) -> Any:
-    """The commands of a phase's vehicles [m] at their places in the group [U]; other rows repeat the first."""
-    size = world.groups[place.group].size
-    if place.local == tuple(range(size)):
-        return command
-    at = np.zeros(size, int)
-    at[np.asarray(place.local)] = np.arange(len(place.local))
-    return jax.tree.map(lambda x: jnp.take(x, at, axis=0), command)
-
-
-def _chosen(world: World, number: int, state: WorldState, given: list[tuple[jax.Array, Any]]) -> Any:
-    """Commands of a group: each vehicle's by the phase that it is in; one in no phase stays where it is."""
-    group = world.groups[number]
+    ``given`` has for each phase of the group whether [] the vehicle is in it, and its command there.
+    """
     kind = KINDS[group.kind]
-    stay = jax.vmap(kind.stay)(group.params, state.groups[number].vehicle)
-    options = [(mask, _full(kind, group.params, command)) for mask, command in given]
+    stay = kind.full_command(params, kind.stay(params, vehicle))
+    options = [(mask, kind.full_command(params, command)) for mask, command in given]
     if any(type(command) is not type(stay) for _, command in options) and isinstance(stay, PositionCommand):
-        rotors = group.params.rotor_spin.shape[-1]
-        full = jax.vmap(partial(multirotor_command, rotors=rotors))
+        full = partial(multirotor_command, rotors=params.rotor_spin.shape[-1])
         stay, options = full(stay), [(mask, full(command)) for mask, command in options]
-    chosen = stay
-    for mask, command in options:
-        chosen = jax.tree.map(partial(_where, mask), command, chosen)
-    return chosen
-
-
-def _full(kind: Any, params: Any, command: Any) -> Any:
-    size = jax.tree.leaves(params)[0].shape[0]
-    every = jax.tree.map(lambda x: x if jnp.ndim(x) else jnp.full(size, x, jnp.float32), command)
-    one = jax.tree.map(lambda x: x[0], params)
-    return jax.vmap(partial(kind.full_command, one))(every)
+    command = stay
+    for mask, other in options:
+        command = jax.tree.map(partial(jnp.where, mask), other, command)
+    return command

@@ -9,7 +9,17 @@ import jax.numpy as jnp
 from swarmsim.estimation import extract_hotspots, recursive_map
 from swarmsim.estimation.windows import windows_start
 from swarmsim.missions import knowledge
-from swarmsim.missions.acting import TASK_AXES, VIEW_AXES, period_ticks, phase_keys, policy_of, rows, tasks, views
+from swarmsim.missions.acting import (
+    TASK_AXES,
+    VIEW_AXES,
+    period_ticks,
+    phase_keys,
+    policy_of,
+    rows,
+    tasks,
+    view_rows,
+    views,
+)
 from swarmsim.missions.plan import Phase, Plan
 from swarmsim.missions.state import NO_PHASE, MissionState, PhaseState, Signals, Survey, now_of
 from swarmsim.policies.path import Path
@@ -99,8 +109,7 @@ def _first_commands(
     policy, commands = policy_of(world, phase), []
     for place in phase.places:
         task = tasks(world, plan, phase, place, path)
-        own = replace(seen[place.group], time_s=None, belief=None)
-        view = replace(rows(own, place.local), time_s=seen[place.group].time_s, belief=seen[place.group].belief)
+        view = view_rows(seen[place.group], place.local)
         keys = phase_keys(world, phase, place, mission.world.key, mission.world.clock.tick)
         call = jax.vmap(policy.act, in_axes=(TASK_AXES, 0, VIEW_AXES, 0))
         commands.append(call(task, rows(memory, place.rank), view, keys)[1])

@@ -21,6 +21,7 @@ from swarmsim.missions.state import Survey
 from swarmsim.pytree import pytree
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
+from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
 from swarmsim.site import Site, path_lengths
 from swarmsim.world.model import World
@@ -125,5 +126,5 @@ def accumulate_spectrum(
 
     start = jnp.zeros_like(detector.background_spectrum)
     mean = jax.lax.scan(add, start, (samples.position_m, samples.axis, live))[0]
-    counts = jax.random.poisson(randomness.consumer(key, "spectrum"), mean).astype(jnp.float32)
-    return Accumulated(counts=counts, live_s=jnp.sum(live))
+    keys = jax.random.split(randomness.consumer(key, "spectrum"), mean.shape[0])
+    return Accumulated(counts=jax.vmap(poisson)(keys, mean), live_s=jnp.sum(live))

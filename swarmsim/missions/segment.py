@@ -8,15 +8,10 @@ import jax.numpy as jnp
 
 from swarmsim.estimation import Measurements, extract_hotspots, recursive_map
 from swarmsim.estimation.windows import gather
-from swarmsim.missions.acting import TASK_AXES, VIEW_AXES, act, policy_of, rows, tasks, views
+from swarmsim.missions.frame import frame
 from swarmsim.missions.plan import Phase, Plan, Trigger
 from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track, now_of
-from swarmsim.world import events
-from swarmsim.world.judge import judge
 from swarmsim.world.model import World
-from swarmsim.world.step import advance
-
-RESTING_HEIGHT_M = 0.1  # a vehicle whose part is done rests if it stands on the ground, else it hovers
 
 
 def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionState, Log, Signals]:
@@ -27,51 +22,36 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     timing = world.timing
     period_s = jnp.float32(timing.control_period_s)
 
-    def tick(mission: MissionState, _: None) -> tuple[MissionState, None]:
-        seen = views(world, plan, mission.world, mission.belief)
-        phases, commands = act(world, plan, mission, seen)
-        return replace(mission, phases=phases, world=advance(world, mission.world, commands)), None
+    def judged(moving: MissionState, _: None) -> tuple[MissionState, tuple[Sampled | None, ...]]:
+        began = now_of(moving, timing.control_period_s)
+        moving = _moving(frame(world, plan, _whole(mission, moving)))
+        return moving, _samples(moving, began + 0.5 * period_s)
 
-    def frame(mission: MissionState, _: None) -> tuple[MissionState, tuple[Any, Any]]:
-        mission = replace(mission, world=judge(world, mission.world))
-        began = now_of(mission, timing.control_period_s)
-        mission, _ = jax.lax.scan(tick, mission, None, length=timing.judge_ticks)
-        mission = _finished(world, plan, mission)
-        return mission, (_poses(mission), _samples(mission, began + 0.5 * period_s))
+    def logged(moving: MissionState, _: None) -> tuple[MissionState, tuple[Any, Any]]:
+        moving, samples = jax.lax.scan(judged, moving, None, length=timing.log_ticks // timing.judge_ticks)
+        return moving, (_poses(moving), samples)
 
-    frames = timing.decision_ticks // timing.judge_ticks
-    every = timing.log_ticks // timing.judge_ticks
+    logs = timing.decision_ticks // timing.log_ticks
     first = mission.world.clock.tick
-    mission, (poses, samples) = jax.lax.scan(frame, mission, None, length=frames)
+    moved, (tracks, samples) = jax.lax.scan(logged, _moving(mission), None, length=logs)
+    mission = _whole(mission, moved)
+    samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     mission = _learned(world, plan, mission, samples)
     mission, signals = decide(world, plan, mission)
-    ends = first + timing.log_ticks * (1 + jnp.arange(timing.decision_ticks // timing.log_ticks))
-    tracks = jax.tree.map(lambda x: x[every - 1 :: every], poses)
+    ends = first + timing.log_ticks * (1 + jnp.arange(logs))
     return mission, Log(time_s=ends * period_s, tracks=tracks, samples=samples), signals
 
 
-def _finished(world: World, plan: Plan, mission: MissionState) -> MissionState:
-    """The mission with the vehicles whose part in their phase is done; those on the ground rest."""
-    now = now_of(mission, world.timing.control_period_s)
-    seen = views(world, plan, mission.world, mission.belief)
-    phases, groups = [], list(mission.world.groups)
-    for number, (phase, state) in enumerate(zip(plan.phases, mission.phases, strict=True)):
-        policy = policy_of(world, phase)
-        done_s = state.done_s
-        for place in phase.places if hasattr(policy, "done") else ():
-            view = replace(seen[place.group], time_s=None, belief=None)  # type: ignore[arg-type]
-            view = replace(rows(view, place.local), time_s=now, belief=seen[place.group].belief)
-            task = tasks(world, plan, phase, place, state.path)
-            done = jax.vmap(policy.done, in_axes=(TASK_AXES, 0, VIEW_AXES))(task, rows(state.memory, place.rank), view)
-            group = groups[place.group]
-            local, rank = jnp.asarray(place.local), jnp.asarray(place.rank)
-            able = events.able(group.event_time_s)[local]
-            done = done & able & (mission.phase_of[place.group][local] == number)
-            done_s = done_s.at[rank].min(jnp.where(done, now, jnp.inf))
-            rests = done & (group.around.height_m[local] < RESTING_HEIGHT_M)
-            groups[place.group] = replace(group, active=group.active.at[local].set(group.active[local] & ~rests))
-        phases.append(replace(state, done_s=done_s))
-    return replace(mission, phases=tuple(phases), world=replace(mission.world, groups=tuple(groups)))
+def _moving(mission: MissionState) -> MissionState:
+    """The mission without what decisions alone change: a loop would copy it from pass to pass."""
+    phases = tuple(replace(phase, path=None) for phase in mission.phases)
+    return replace(mission, phases=phases, phase_of=(), belief=None, windows=(), survey=None)
+
+
+def _whole(mission: MissionState, moving: MissionState) -> MissionState:
+    """The mission with what moves in it."""
+    phases = tuple(replace(new, path=old.path) for new, old in zip(moving.phases, mission.phases, strict=True))
+    return replace(mission, phases=phases, world=moving.world)
 
 
 def _poses(mission: MissionState) -> tuple[Track, ...]:

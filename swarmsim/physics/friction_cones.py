@@ -196,14 +196,19 @@ def _solve_body(
 ) -> tuple[jax.Array, jax.Array]:
     """Linear and angular acceleration [3], [3] of the body alone, its contacts having the ``hessian`` [4, 3, 3]."""
     axes, moments = contacts.axes, contacts.moments
-    by_linear = jnp.sum(hessian[:, :, :, None] * axes[:, None], axis=2)
-    by_angular = jnp.sum(hessian[:, :, :, None] * moments[:, None], axis=2)
+    by_linear, by_angular = _rows_by(hessian, axes), _rows_by(hessian, moments)
     inverse = _inverse(_gram(axes, by_linear) + contacts.mass_kg * jnp.eye(3))
     mixed = _gram(moments, by_linear)
     across = _product(mixed, inverse)
     held = _gram(moments, by_angular) + contacts.inertia_kg_m2 - _product(across, mixed.T)
     angular = jnp.sum(_inverse(held) * (torque - jnp.sum(across * force, axis=-1)), axis=-1)
     return jnp.sum(inverse * force, axis=-1) - jnp.sum(across * angular[:, None], axis=0), angular
+
+
+def _rows_by(hessian: jax.Array, b: jax.Array) -> jax.Array:
+    """Product [4, 3, 3] of each contact's ``hessian`` with its rows ``b`` [4, 3, 3]."""
+    first, second, third = (hessian[:, :, row, None] * b[:, None, row] for row in range(3))
+    return first + second + third
 
 
 def _gram(a: jax.Array, b: jax.Array) -> jax.Array:

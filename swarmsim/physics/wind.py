@@ -60,23 +60,27 @@ def gust_start(key: jax.Array) -> GustState:
     return GustState(along=n[0], across=_steady(n[1:3]), vertical=_steady(n[3:5]))
 
 
+def gust_noise(key: jax.Array) -> jax.Array:
+    """White noise [5] for one `gust_step`."""
+    return jax.random.normal(key, (5,))
+
+
 def gust_step(
-    key: jax.Array, state: GustState, *, speed_m_s: jax.Array, height_m: jax.Array, airspeed_m_s: jax.Array, dt: float
+    noise: jax.Array, state: GustState, *, speed_m_s: jax.Array, height_m: jax.Array, airspeed_m_s: jax.Array, dt: float
 ) -> GustState:
     """The filters ``dt`` s later; ``airspeed_m_s`` [] is the vehicle's speed through the air, ``speed_m_s`` as above.
 
     White noise through the Dryden filters 1 / (1 + L s / V) along the wind and (1 + sqrt(3) L s / V) / (1 + L s / V)^2
     across and up, discretised exactly (matrix exponential and covariance over the step), so that the variance does not
-    depend on ``dt``.
+    depend on ``dt``. ``noise`` is that of `gust_noise`.
     """
-    n = jax.random.normal(key, (5,))
     _, lengths = gust_scales(speed_m_s, height_m)
     passed = jnp.clip(jnp.maximum(airspeed_m_s, AIRSPEED_MIN_M_S) * dt / lengths, 0.0, 0.5)
     keep = jnp.exp(-passed[0])
     return GustState(
-        along=keep * state.along + jnp.sqrt(-jnp.expm1(-2.0 * passed[0])) * n[0],
-        across=_second_order(state.across, passed[0], n[1:3]),
-        vertical=_second_order(state.vertical, passed[1], n[3:5]),
+        along=keep * state.along + jnp.sqrt(-jnp.expm1(-2.0 * passed[0])) * noise[0],
+        across=_second_order(state.across, passed[0], noise[1:3]),
+        vertical=_second_order(state.vertical, passed[1], noise[3:5]),
     )
 
 

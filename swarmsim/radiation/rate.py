@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from swarmsim.radiation.cylinder import direction_basis, solid_angle_per_area
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.library import BUILD_UP_SCALE
+from swarmsim.radiation.poisson import poisson
 
 
 def line_rates(
@@ -83,15 +84,14 @@ def observed_rate(detector: Detector, net_cps: jax.Array) -> jax.Array:
 def draw_counts(
     detector: Detector, key: jax.Array, mean_observed_cps: jax.Array, live_s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts of one measurement and the exposure in s that they represent, both [...].
+    """Counts of one measurement and the exposure in s that they represent, both [].
 
     ``physical``: Poisson counts over the live time ``live_s``. ``paper_ideal``: as the Gazebo plugin, Poisson(rate) for
     every message, which represents one second whatever the message rate.
     """
     exposure = jnp.asarray(live_s, jnp.float32) if detector.kind == "physical" else jnp.ones_like(mean_observed_cps)
     exposure = jnp.broadcast_to(exposure, jnp.shape(mean_observed_cps))
-    counts = jax.random.poisson(key, mean_observed_cps * exposure).astype(jnp.float32)
-    return counts, exposure
+    return poisson(key, mean_observed_cps * exposure), exposure
 
 
 def spectrum_rate(

@@ -168,32 +168,31 @@ def _every(apply: Callable[..., Any], own: Any, common: Any) -> Any:
 
 
 def _in_turn(together: int, apply: Callable[..., Any], own: Any, common: Any) -> Any:
-    """Groups of missions after one another; a group without a mission that is asked for keeps what it carries."""
+    """Groups of missions after one another; where only some are asked for, the groups are made up of those."""
     _, carried, only = own
     missions = jax.tree.leaves(carried)[0].shape[0]
-    size = together if missions % together == 0 else 1
-    grouped = jax.tree.map(lambda x: x.reshape(missions // size, size, *x.shape[1:]), own)
+    size = min(together, missions)
+    places = jnp.arange(-(-missions // size) * size)
 
-    def evaluate(own: Any) -> Any:
-        return jax.vmap(apply, in_axes=(0, None))(own, common) if size > 1 else _alone(apply, own, common)
+    def evaluate(places: jax.Array, carried: Any = carried) -> Any:
+        group = jax.tree.map(lambda x: x[jnp.minimum(places, missions - 1)], (own[0], carried, only))
+        return jax.vmap(apply, in_axes=(0, None))(group, common) if size > 1 else _alone(apply, group, common)
 
-    def those_asked(own: Any) -> Any:
-        _, carried, only = own
+    if only is None:
+        made = jax.lax.map(evaluate, places.reshape(-1, size))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:missions], made)
+    asked = jnp.sum(only)
+    order = jnp.argsort(~only, stable=True)
+    order = jnp.where(places < asked, order[jnp.minimum(places, missions - 1)], missions)  # the rest is dropped
 
-        def new() -> Any:
-            return jax.tree.map(partial(_where, only), evaluate(own), carried)
+    def take(number: jax.Array, carried: Any) -> Any:
+        group = jax.lax.dynamic_slice(order, (number * size,), (size,))
+        return jax.tree.map(lambda new, old: old.at[group].set(new, mode="drop"), evaluate(group, carried), carried)
 
-        return jax.lax.cond(jnp.any(only), new, lambda: carried)
-
-    made = jax.lax.map(evaluate if only is None else those_asked, grouped)
-    return jax.tree.map(lambda x: x.reshape(missions, *x.shape[2:]), made)
+    return jax.lax.fori_loop(0, -(-asked // size), take, carried)
 
 
 def _alone(apply: Callable[..., Any], own: Any, common: Any) -> Any:
     """The function of a group of one mission, without vmap: conditions stay conditions."""
     result = apply(jax.tree.map(lambda x: x[0], own), common)
     return jax.tree.map(lambda x: jnp.asarray(x)[None], result)
-
-
-def _where(mask: jax.Array, new: jax.Array, old: jax.Array) -> jax.Array:
-    return jnp.where(mask.reshape(-1, *(1,) * (new.ndim - 1)), new, old)

@@ -61,7 +61,7 @@ def _load_all(interpreter: Interpreter, arrays: Sequence[Any], avals: Sequence[A
     return [interpreter.load(queue, aval, of_vehicle) for aval, of_vehicle in zip(avals, mapped, strict=True)]
 
 
-def _loop_counts(params: Any) -> tuple[int, int]:
+def loop_counts(params: Any) -> tuple[int, int]:
     """Where a scan's carry and its rows begin among its inputs."""
     if "num_consts" in params:  # before jax 0.11
         return params["num_consts"], params["num_consts"] + params["num_carry"]
@@ -73,7 +73,7 @@ def _scan(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[
     p = equation.params
     if p["length"] <= interpreter.unroll:
         return _written_out(interpreter, equation, values)
-    body, (first_carry, split) = p["jaxpr"], _loop_counts(p)
+    body, (first_carry, split) = p["jaxpr"], loop_counts(p)
     consts, carry, rows = values[:first_carry], values[first_carry:split], values[split:]
     avals = [v.aval for v in body.jaxpr.invars]
     carry_avals, row_avals = avals[first_carry:split], avals[split:]
@@ -119,7 +119,7 @@ def _history(interpreter: Interpreter, queue: list[Any], full: Any, aval: Any, m
 
 def _written_out(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[Value]:
     p = equation.params
-    first_carry, split = _loop_counts(p)
+    first_carry, split = loop_counts(p)
     consts, carry, rows = values[:first_carry], values[first_carry:split], values[split:]
     row_avals = [v.aval for v in p["jaxpr"].jaxpr.invars[split:]]
     order = range(p["length"])

@@ -154,7 +154,7 @@ def _filling(dtype: Any, given: Any) -> np.generic:
     return filling
 
 
-def _full_start(
+def full_start(
     rank: int, indices: np.ndarray, batch: tuple[int, ...], axes: Iterable[int], shared: Iterable[tuple[int, int]]
 ) -> list[Scalar]:
     """First index of a window in all axes of the operand."""
@@ -166,20 +166,48 @@ def _full_start(
     return start
 
 
-def _gather(graph: Graph, equation: Any, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    p, out = equation.params, equation.outvars[0].aval
-    numbers, clip = p["dimension_numbers"], _clips(p["mode"])
-    windows = _Windows(graph, x.shape, p["slice_sizes"], clip, _kind(equation.invars[1]))
+@dataclass(frozen=True)
+class GatherPlan:
+    """What `jax.lax.gather` does, whatever it reads from."""
+
+    sizes: tuple[int, ...]  # of a window, with all axes of the operand
+    axes: tuple[int, ...]  # of the operand, that an index has
+    shared: tuple[tuple[int, int], ...]  # axes of operand and indices that go together
+    clip: bool  # indices out of bounds mean the nearest window inside, or else `outside`
+    outside: Scalar
+    window_shape: tuple[int, ...]
+    offset_dims: tuple[int, ...]
+
+    def arranged(self, read: list[Scalar], batches: tuple[int, ...]) -> np.ndarray:
+        """The result from the entries of each window in turn."""
+        found = _objects(read).reshape((*batches, *self.window_shape))
+        return np.moveaxis(found, range(len(batches), found.ndim), self.offset_dims)
+
+
+def gather_plan(equation: Any) -> GatherPlan:
+    """The plan of a gather; raises `NotWritableError` for a mode that has no form in scalars."""
+    p, numbers = equation.params, equation.params["dimension_numbers"]
+    clip = _clips(p["mode"])
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
-    window_shape = [size for axis, size in enumerate(p["slice_sizes"]) if axis not in dropped]
-    shared = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
-    outside = None if clip else _filling(np.dtype(out.dtype), p["fill_value"])
+    return GatherPlan(
+        sizes=tuple(p["slice_sizes"]),
+        axes=tuple(numbers.start_index_map),
+        shared=tuple(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True)),
+        clip=clip,
+        outside=None if clip else _filling(np.dtype(equation.outvars[0].aval.dtype), p["fill_value"]),
+        window_shape=tuple(size for axis, size in enumerate(p["slice_sizes"]) if axis not in dropped),
+        offset_dims=tuple(numbers.offset_dims),
+    )
+
+
+def _gather(graph: Graph, equation: Any, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    plan = gather_plan(equation)
+    windows = _Windows(graph, x.shape, plan.sizes, plan.clip, _kind(equation.invars[1]))
     batches = indices.shape[:-1]
     read: list[Scalar] = []
     for batch in np.ndindex(*batches):
-        read += windows.read(x, _full_start(x.ndim, indices, batch, numbers.start_index_map, shared), outside)
-    found = _objects(read).reshape((*batches, *window_shape))
-    return np.moveaxis(found, range(len(batches), found.ndim), numbers.offset_dims)
+        read += windows.read(x, full_start(x.ndim, indices, batch, plan.axes, plan.shared), plan.outside)
+    return plan.arranged(read, batches)
 
 
 def _scatter(combine: Operation | None) -> Rule:
@@ -196,7 +224,7 @@ def _scatter(combine: Operation | None) -> Rule:
         shared = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
         updates, written = updates.reshape(*batches, *sizes), as_objects(x).copy()
         for batch in np.ndindex(*batches):
-            start = _full_start(x.ndim, indices, batch, numbers.scatter_dims_to_operand_dims, shared)
+            start = full_start(x.ndim, indices, batch, numbers.scatter_dims_to_operand_dims, shared)
             windows.write(written, start, updates[batch], combine)
         return written
 

@@ -14,10 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.scalars.interpreter import UNROLL, is_foldable
+from swarmsim.scalars.kernel import on_gpu
 from swarmsim.scalars.program import Program, on_cpu
 
 Layout = Literal["scalars", "vmap"]
 LAYOUTS = ("scalars", "vmap")
+_ARRANGED: dict[str, Callable[..., Any]] = {
+    "cpu": on_cpu,
+    "gpu": on_gpu,
+    "gpu, interpreted": partial(on_gpu, interpret=True),  # for tests of the kernels
+}
 
 
 def over_vehicles(
@@ -69,8 +75,8 @@ def over_vehicles(
         varied = [axis is not None for axis in leaf_axes]
         program, arrays, structure = _program(function, tree, moved, varied, unroll)
         of_vehicle = [False] * (len(arrays) - sum(varied)) + [True] * sum(varied)
-        cpu = (platform or jax.default_backend()) == "cpu"
-        evaluate = on_cpu(program, size, of_vehicle) if cpu else partial(program.evaluate, size, of_vehicle)
+        arranged = _ARRANGED.get(platform or jax.default_backend())
+        evaluate = arranged(program, size, of_vehicle) if arranged else partial(program.evaluate, size, of_vehicle)
         return jax.tree.unflatten(structure, evaluate(*arrays))
 
     return mapped

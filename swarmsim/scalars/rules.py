@@ -183,6 +183,7 @@ REARRANGE: dict[str, Callable[..., Any]] = {
     "split": _split,
     "concatenate": _joined(np.concatenate, "dimension"),
     "stack": _joined(np.stack, "axis"),
+    "unstack": lambda p, x: [np.moveaxis(x, p["axis"], 0)[k, ...] for k in range(x.shape[p["axis"]])],
     "pad": _pad,
     "copy": lambda p, x: x,
     "copy_p": lambda p, x: x,
@@ -306,4 +307,5 @@ RULES: dict[str, Rule] = {
     "dot_general": _dot_general,
     "sort": _sort,
     "iota": _iota,
+    "empty": lambda graph, equation: np.zeros(equation.outvars[0].aval.shape, equation.outvars[0].aval.dtype),
 }

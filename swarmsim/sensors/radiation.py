@@ -93,6 +93,11 @@ def source_rate(site: Site, detector: Detector, sources: Source, position_m: jax
     return jnp.sum(jax.vmap(one)(sources))
 
 
+def unread(state: CounterState) -> CounterState:
+    """The counters with no reading that is fresh."""
+    return replace(state, reading=replace(state.reading, fresh=jnp.zeros_like(state.reading.fresh)))
+
+
 def count(
     counter: Counter,
     state: CounterState,
@@ -104,33 +109,36 @@ def count(
     key: jax.Array,
     tick: jax.Array,
     control_period_s: float,
+    due: jax.Array,
 ) -> CounterState:
-    """The counters (axis U) at the end of control period ``tick`` [] (counted from 1).
+    """The counters (axis U) after the rate was evaluated at the end of control period ``tick``, if that is ``due``.
 
-    The rate is evaluated every ``counter.ticks`` control periods, where the vehicle then is; its mean over the
+    The rate is due every ``counter.ticks`` control periods, where the vehicle then is; its mean over the
     ``counter.evaluations`` of an exposure is the mean of the Poisson counts.
 
     Args:
         counter, state: of the group.
-        body: poses and velocities [U].
+        body: poses and velocities [U] then.
         active: [U] bool, vehicles that have a part in the mission.
         member: [U] int32, number of each vehicle in the mission.
         site, sources: the true world.
         key: of the mission; a draw depends on it, the time and the vehicle's number only.
-        tick, control_period_s: the time.
+        tick, control_period_s: the time; the first control period has the number 1.
+        due: [] bool; without it the state is returned as it is.
     """
-    state = replace(state, reading=replace(state.reading, fresh=jnp.zeros_like(state.reading.fresh)))
     # Across the branches go the key's bits: JAX (0.10.1) cannot take the gradient of a scan whose `cond` keeps a key.
     bits, impl = jax.random.key_data(key), jax.random.key_impl(key)
-
-    def evaluate(state: CounterState) -> CounterState:
-        return _evaluated(counter, state, body, active, site, sources)
 
     def finish(state: CounterState) -> CounterState:
         return _read_out(counter, state, member, jax.random.wrap_key_data(bits, impl=impl), tick, control_period_s)
 
-    state = jax.lax.cond(tick % counter.ticks == 0, evaluate, lambda s: s, state)
-    return jax.lax.cond(tick % (counter.ticks * counter.evaluations) == 0, finish, lambda s: s, state)
+    def evaluate(state: CounterState) -> CounterState:
+        state = _evaluated(counter, state, body, active, site, sources)
+        if counter.evaluations == 1:
+            return finish(state)
+        return jax.lax.cond(tick % (counter.ticks * counter.evaluations) == 0, finish, lambda s: s, state)
+
+    return jax.lax.cond(due, evaluate, lambda s: s, state)
 
 
 def _evaluated(

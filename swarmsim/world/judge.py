@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim import randomness
-from swarmsim.physics.wind import gust_step, gust_velocity, steady_wind
+from swarmsim.physics.wind import gust_noise, gust_step, gust_velocity, steady_wind
+from swarmsim.scalars import over_vehicles
 from swarmsim.world import events
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
@@ -20,31 +21,62 @@ from swarmsim.world.state import GroupState, Surroundings, WorldState
 
 def judge(world: World, state: WorldState) -> WorldState:
     """The state with the surroundings of every vehicle refreshed and its events recorded."""
+    state, collided = look_around(world, state)
+    now = now_s(world, state)
+    groups = []
+    for group, g, hit in zip(world.groups, state.groups, collided, strict=True):
+        one = partial(record_events, world, group.kind, now)
+        seen = replace(g, counter=None)
+        judged = over_vehicles(one, layout=world.layout, unroll=1)(group.params, group.limits, seen, hit)
+        groups.append(replace(judged, counter=g.counter))
+    return replace(state, groups=tuple(groups))
+
+
+def now_s(world: World, state: WorldState) -> jax.Array:
+    """The time [] of the world in s."""
+    return state.clock.tick * jnp.float32(world.timing.control_period_s)
+
+
+def look_around(world: World, state: WorldState) -> tuple[WorldState, list[jax.Array]]:
+    """The state with ground, wind, traffic and radio refreshed, and which vehicles [U] of each group have collided."""
     number = state.clock.tick // world.timing.judge_ticks
     gusts = randomness.consumer(state.key, "gusts")
-    groups = tuple(
-        jax.lax.cond(running, partial(_refreshed, world, group, gusts, number), lambda g: g, g)
+    around = [
+        jax.lax.cond(running, partial(_refreshed, world, group, gusts, number), lambda _, old: old, g.vehicle, g.around)
         for running, group, g in zip(state.clock.running, world.groups, state.groups, strict=True)
-    )
+    ]
+    groups = tuple(replace(g, around=new) for g, new in zip(state.groups, around, strict=True))
     groups, collided, crowded = _in_traffic(world, groups)
-    now = state.clock.tick * jnp.float32(world.timing.control_period_s)
-    groups = tuple(
-        _with_events(world, group, g, hit, now) for group, g, hit in zip(world.groups, groups, collided, strict=True)
-    )
     state = replace(state, groups=groups, crowded=state.crowded | crowded)
-    return replace(state, radio=broadcast(world, state, number))
+    return replace(state, radio=broadcast(world, state, number)), collided
 
 
-def _refreshed(world: World, group: Group, gusts: jax.Array, number: jax.Array, state: GroupState) -> GroupState:
-    """The group with ground, height and wind where its vehicles are now."""
+def record_events(
+    world: World, kind_name: str, now_s: jax.Array, params: Any, limits: Limits, state: GroupState, collided: jax.Array
+) -> GroupState:
+    """One vehicle with the events of the judging period that ends at ``now_s`` [] recorded."""
+    kind = KINDS[kind_name]
+    height, impact = state.around.height_m, state.impact_m_s
+    crash = kind.crashed(params, state.vehicle, height, impact, limits)
+    obstacle = kind.obstructed(params, state.vehicle, impact, limits, world.site)
+    empty = state.vehicle.energy_j > limits.battery_j
+    happened = jnp.stack([crash, obstacle, collided, empty, jnp.array(False)]) & state.finite
+    happened = happened.at[events.NON_FINITE].set(~state.finite) & state.active
+    times = events.record(state.event_time_s, happened, now_s)
+    return replace(state, event_time_s=times, impact_m_s=jnp.zeros_like(state.impact_m_s))
+
+
+def _refreshed(
+    world: World, group: Group, gusts: jax.Array, number: jax.Array, vehicles: Any, around: Surroundings
+) -> Surroundings:
+    """What is around a group's vehicles, with ground, height and wind where they are now."""
     kind = KINDS[group.kind]
-    keys = randomness.per_vehicle(gusts, number, group.member)
 
-    def one(key: jax.Array, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
+    def one(noise: jax.Array | None, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
         body = vehicle.body
         ground = ground_below(world.site, body.position_m)
         height = kind.height(params, vehicle, ground)
-        if not kind.FLIES:
+        if noise is None:
             return replace(around, ground=ground, height_m=height)
         air = world.air
         above = jnp.maximum(body.position_m[2] - ground.point_m[2], 0.0)
@@ -52,13 +84,16 @@ def _refreshed(world: World, group: Group, gusts: jax.Array, number: jax.Array, 
         through = body.velocity_m_s - steady
         airspeed = jnp.sqrt(jnp.sum(through * through) + 1e-12)
         gust = gust_step(
-            key, around.gust, speed_m_s=air.speed_m_s, height_m=above, airspeed_m_s=airspeed,
+            noise, around.gust, speed_m_s=air.speed_m_s, height_m=above, airspeed_m_s=airspeed,
             dt=world.timing.judge_period_s,
         )  # fmt: skip
         wind = steady + air.gusts * gust_velocity(gust, air.speed_m_s, air.from_rad, above)
         return replace(around, ground=ground, height_m=height, gust=gust, wind_m_s=wind)
 
-    return replace(state, around=jax.vmap(one)(keys, group.params, state.vehicle, state.around))
+    noise = jax.vmap(gust_noise)(randomness.per_vehicle(gusts, number, group.member)) if kind.FLIES else None
+    every = over_vehicles(one, layout=world.layout, unroll=1)
+    refreshed: Surroundings = every(noise, group.params, vehicles, around)
+    return refreshed
 
 
 def _in_traffic(
@@ -93,21 +128,3 @@ def _in_traffic(
         collided.append(traffic.collided[part])
         first += group.size
     return tuple(told), collided, traffic.overflow
-
-
-def _with_events(world: World, group: Group, state: GroupState, collided: jax.Array, now_s: jax.Array) -> GroupState:
-    """The group with the events of the period that ends at ``now_s`` [] recorded."""
-    kind = KINDS[group.kind]
-
-    def one(params: Any, limits: Limits, state: GroupState, collided: jax.Array) -> jax.Array:
-        height, impact = state.around.height_m, state.impact_m_s
-        crash = kind.crashed(params, state.vehicle, height, impact, limits)
-        obstacle = kind.obstructed(params, state.vehicle, impact, limits, world.site)
-        empty = state.vehicle.energy_j > limits.battery_j
-        happened = jnp.stack([crash, obstacle, collided, empty, jnp.array(False)]) & state.finite
-        happened = happened.at[events.NON_FINITE].set(~state.finite) & state.active
-        return events.record(state.event_time_s, happened, now_s)
-
-    seen = replace(state, counter=None)
-    times = jax.vmap(one)(group.params, group.limits, seen, collided)
-    return replace(state, event_time_s=times, impact_m_s=jnp.zeros_like(state.impact_m_s))

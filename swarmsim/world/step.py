@@ -15,7 +15,7 @@ from swarmsim import randomness
 from swarmsim.physics.wind import gust_start
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
-from swarmsim.sensors.radiation import count, counter_start
+from swarmsim.sensors.radiation import count, counter_start, unread
 from swarmsim.world import events
 from swarmsim.world.judge import judge
 from swarmsim.world.kinds import KINDS
@@ -139,8 +139,8 @@ def advance(world: World, state: WorldState, commands: Sequence[Any]) -> WorldSt
 
 
 @pytree
-class _Moved:
-    """One vehicle after a control period."""
+class Moved:
+    """What a control period changes of a vehicle, its counter apart."""
 
     vehicle: Any
     control: Any
@@ -148,37 +148,41 @@ class _Moved:
     finite: jax.Array  # []
 
 
+def move(world: World, kind: str, params: Any, state: GroupState, command: Any) -> Moved:
+    """One vehicle after a control period under a full command; ``state`` is its row of the group's."""
+    timing = world.timing
+    armed = state.active & events.able(state.event_time_s)
+    vehicle, control, impact = KINDS[kind].tick(
+        params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wind_m_s, world.site,
+        engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps, layout=world.layout,
+    )  # fmt: skip
+    total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))
+    finite = jnp.isfinite(total)  # a sum is finite only if all of its parts are
+    moves = state.active & finite & state.finite
+    kept = jax.tree.map(lambda new, old: jnp.where(moves, new, old), (vehicle, control), (state.vehicle, state.control))
+    impact = jnp.maximum(state.impact_m_s, jnp.where(moves, impact, 0.0))
+    return Moved(vehicle=kept[0], control=kept[1], impact_m_s=impact, finite=state.finite & finite)
+
+
+def with_move(state: GroupState, moved: Moved) -> GroupState:
+    """The state after a move; of one vehicle, or of a group."""
+    return replace(
+        state, vehicle=moved.vehicle, control=moved.control, impact_m_s=moved.impact_m_s, finite=moved.finite
+    )
+
+
 def _advance_group(
     world: World, group: Group, key: jax.Array, tick: jax.Array, command: Any, before: GroupState
 ) -> GroupState:
-    kind, timing = KINDS[group.kind], world.timing
-
-    def one(params: Any, state: GroupState, command: Any, site: Any) -> _Moved:
-        armed = state.active & events.able(state.event_time_s)
-        vehicle, control, impact = kind.tick(
-            params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wind_m_s, site,
-            engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps, layout=world.layout,
-        )  # fmt: skip
-        total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))
-        finite = jnp.isfinite(total)  # a sum is finite only if all of its parts are
-        moves = state.active & finite & state.finite
-        kept = jax.tree.map(
-            lambda new, old: jnp.where(moves, new, old), (vehicle, control), (state.vehicle, state.control)
-        )
-        impact = jnp.maximum(state.impact_m_s, jnp.where(moves, impact, 0.0))
-        return _Moved(vehicle=kept[0], control=kept[1], impact_m_s=impact, finite=state.finite & finite)
-
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
-    every = over_vehicles(one, in_axes=(0, 0, 0, None), layout=world.layout, unroll=1)
-    moved = every(group.params, seen, command, world.site)
-    after = replace(
-        before, vehicle=moved.vehicle, control=moved.control, impact_m_s=moved.impact_m_s, finite=moved.finite
-    )
+    one = partial(move, world, group.kind)
+    every = over_vehicles(one, layout=world.layout, unroll=1)
+    after = with_move(before, every(group.params, seen, command))
     if group.counter is None or before.counter is None:
         return after
     measuring = after.active & events.able(after.event_time_s)
     counter = count(
-        group.counter, before.counter, after.vehicle.body, measuring, group.member, world.site, world.sources, key,
-        tick, timing.control_period_s,
+        group.counter, unread(before.counter), after.vehicle.body, measuring, group.member, world.site, world.sources,
+        key, tick, world.timing.control_period_s, tick % group.counter.ticks == 0,
     )  # fmt: skip
     return replace(after, counter=counter)

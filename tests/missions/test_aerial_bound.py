@@ -50,7 +50,9 @@ def survey():
     live_s = float(joined.exposure_s.max())
 
     def windows(key):
-        counts, exposure = draw_counts(counter.detector, key, flat, live_s)
+        keys = jax.random.split(key, flat.shape)
+        each = jax.vmap(jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, live_s)))
+        counts, exposure = each(keys, flat)
         drawn = Measurements(
             time_s=joined.time_s, position_m=joined.position_m, travel_m=joined.travel_m, axis=joined.axis,
             counts=counts, exposure_s=exposure, valid=joined.new, detector=jnp.zeros(counts.shape, jnp.int32),

@@ -39,9 +39,8 @@ def _series(dt, steps, batch, airspeed, height, speed=10.0):
 
     def one(key):
         def body(state, k):
-            state = wind.gust_step(
-                jax.random.fold_in(key, k), state, speed_m_s=speed, height_m=height, airspeed_m_s=airspeed, dt=dt
-            )
+            noise = wind.gust_noise(jax.random.fold_in(key, k))
+            state = wind.gust_step(noise, state, speed_m_s=speed, height_m=height, airspeed_m_s=airspeed, dt=dt)
             return state, wind.gust_velocity(state, speed, jnp.pi * 1.5, height)  # blows to the east: u is x
 
         return jax.lax.scan(body, wind.gust_start(jax.random.fold_in(key, 10**6)), jnp.arange(steps))[1]
@@ -81,7 +80,7 @@ def test_second_order_filter_is_discretised_exactly(passed):
 def test_gusts_are_keyed_and_die_in_calm():
     start = wind.gust_start(jax.random.key(1))
     step = lambda key: wind.gust_step(  # noqa: E731 - one call, three keys
-        jax.random.key(key), start, speed_m_s=5.0, height_m=20.0, airspeed_m_s=5.0, dt=0.01
+        wind.gust_noise(jax.random.key(key)), start, speed_m_s=5.0, height_m=20.0, airspeed_m_s=5.0, dt=0.01
     )
     same, other = step(1), step(2)
     np.testing.assert_array_equal(step(1).across, same.across)

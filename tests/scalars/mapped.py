@@ -30,8 +30,8 @@ def assert_alike(found, expected, rtol=1e-5, atol=1e-5):
         np.testing.assert_allclose(a, b, rtol=rtol, atol=atol)
 
 
-PLATFORMS = ("cpu", "gpu")  # how the program is arranged; both are run here
-on_gpu = partial(over_vehicles, platform="gpu")
+PLATFORMS = ("cpu", "as it is", "gpu, interpreted")  # how the program is arranged; all are run here
+as_it_is = partial(over_vehicles, platform="as it is")
 
 
 def check(function, *args, in_axes=0, **options):
@@ -45,7 +45,7 @@ def check(function, *args, in_axes=0, **options):
 
 def primitives_of(function, *args, in_axes=0):
     """Names of the primitives that are bound."""
-    return [e.primitive.name for e in jax.make_jaxpr(on_gpu(function, in_axes))(*args).eqns]
+    return [e.primitive.name for e in jax.make_jaxpr(as_it_is(function, in_axes))(*args).eqns]
 
 
 x3, x4, x34, x33 = numbers(3), numbers(4, seed=1), numbers(3, 4, seed=2), numbers(3, 3, seed=3)

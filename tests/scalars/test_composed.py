@@ -15,7 +15,7 @@ from swarmsim.control.multirotor import control, control_start
 from swarmsim.physics.multirotor import make_multirotor_step
 from swarmsim.scalars import over_vehicles
 from tests.flights import ENGINES, airborne, hover_speed, params_of, plane
-from tests.scalars.mapped import MISSIONS, PLATFORMS, RASTER, N, assert_alike, check, indices, numbers, on_gpu, x3
+from tests.scalars.mapped import MISSIONS, PLATFORMS, RASTER, N, as_it_is, assert_alike, check, indices, numbers, x3
 
 
 def test_keys():
@@ -48,7 +48,7 @@ def test_branches():
         x3,
         x3[:, 0] > 0,
     )
-    shared = jax.jit(lambda on: on_gpu(lambda x, on: nested(x, on), (0, None))(x3, on))
+    shared = jax.jit(lambda on: as_it_is(lambda x, on: nested(x, on), (0, None))(x3, on))
     assert "cond" in str(jax.make_jaxpr(shared)(True))
 
 
@@ -90,7 +90,7 @@ def test_derivatives_of_its_own():
 
     doubled.defvjp(lambda x, scale: (doubled(x, scale), scale), lambda scale, g: (5.0 * g["y"], jnp.zeros_like(scale)))
     check(lambda x: doubled(x, jnp.float32(1.0)), x3)
-    for mapped in (over_vehicles, on_gpu):
+    for mapped in (over_vehicles, as_it_is):
         gradient = jax.grad(lambda x, f=mapped: jnp.sum(f(lambda x: doubled(x, x[0])["y"])(x)))(x3)
         assert_alike(gradient, jnp.full((N, 3), 5.0))
 
@@ -238,7 +238,7 @@ def test_gradient_of_a_multirotor():
         return jnp.sum(after.body.position_m**2) + jnp.sum(after.body.velocity_m_s[:, 2]) + jnp.sum(after.energy_j)
 
     args = state.body.position_m, params.mass_kg
-    found, expected = (jax.jit(jax.grad(partial(loss, f), argnums=(0, 1)))(*args) for f in (on_gpu, jax.vmap))
+    found, expected = (jax.jit(jax.grad(partial(loss, f), argnums=(0, 1)))(*args) for f in (as_it_is, jax.vmap))
     assert_alike(found, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -249,6 +249,6 @@ def test_derivatives_beside_keys_and_integers():
         noisy = mapped(lambda x, i, key: x[i] * jax.random.normal(key) + x[0])(x, indices(3), keys)
         return jnp.sum(noisy**2)
 
-    found = [jax.grad(partial(loss, f))(x3) for f in (over_vehicles, on_gpu, jax.vmap)]
+    found = [jax.grad(partial(loss, f))(x3) for f in (over_vehicles, as_it_is, jax.vmap)]
     for result in found[:2]:
         assert_alike(result, found[2])
