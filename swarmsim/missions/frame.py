@@ -32,14 +32,15 @@ from swarmsim.missions.acting import (
 )
 from swarmsim.missions.plan import Phase, Place, Plan
 from swarmsim.missions.state import MissionState, PhaseState
-from swarmsim.policies.view import View
+from swarmsim.policies.view import Belief, Task, View
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
-from swarmsim.sensors.radiation import Counter, CounterState, count, unread
+from swarmsim.sensors.radiation import Reading, count, unread
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world import events
 from swarmsim.world.judge import look_around, now_s, record_events
 from swarmsim.world.model import Group, Limits, World
+from swarmsim.world.radio import Heard
 from swarmsim.world.state import GroupState
 from swarmsim.world.step import move, with_move
 
@@ -60,7 +61,7 @@ class _Flown:
 
     state: GroupState
     parts: tuple[_Part, ...]
-    done: tuple[jax.Array, ...]  # for each part: whether [U] the vehicle's part in the phase is done
+    done_s: tuple[jax.Array, ...]  # for each part: when [U] the vehicle's part in the phase was done; inf: it is not
     seen: tuple[RigidState, ...]  # where the detectors' rates were due
 
 
@@ -82,14 +83,13 @@ def frame(world: World, plan: Plan, mission: MissionState) -> MissionState:
     mission = replace(mission, world=seen)
     mission = replace(mission, phases=ask(world, plan, mission))
     groups, phases = list(mission.world.groups), list(mission.phases)
-    clock = mission.world.clock
     for number in range(len(groups)):
         roles = _roles(world, plan, number)
-        mine = tuple(replace(phases[role.number], path=None) for role in roles)  # a branch would copy the paths
-        go = partial(_group, world, plan, mission, number, roles, collided[number])
-        groups[number], after = jax.lax.cond(clock.running[number], go, lambda *x: x, groups[number], mine)
-        for role, phase in zip(roles, after, strict=True):
-            phases[role.number] = replace(phase, path=phases[role.number].path)
+        flown = _fly(world, plan, mission, number, roles, collided[number])
+        groups[number] = _counted(world, mission, number, flown)
+        for role, part, done_s in zip(roles, flown.parts, flown.done_s, strict=True):
+            phases[role.number] = _with_part(phases[role.number], role, part, done_s)
+    clock = mission.world.clock
     clock = replace(clock, tick=clock.tick + world.timing.judge_ticks)
     return replace(mission, phases=tuple(phases), world=replace(mission.world, groups=tuple(groups), clock=clock))
 
@@ -104,103 +104,104 @@ def _roles(world: World, plan: Plan, group: int) -> tuple[_Role, ...]:
     return tuple(found)
 
 
-def _group(
-    world: World,
-    plan: Plan,
-    mission: MissionState,
-    number: int,
-    roles: Sequence[_Role],
-    collided: jax.Array,
-    before: GroupState,
-    phases: tuple[PhaseState, ...],
-) -> tuple[GroupState, tuple[PhaseState, ...]]:
-    """A group and the phases that it has a part in, after the control periods of a judging period."""
-    group, timing = world.groups[number], world.timing
-    first = mission.world.clock.tick
-    flown = _fly(world, plan, mission, number, roles, collided, before, phases)
-    now = (first + timing.judge_ticks) * jnp.float32(timing.control_period_s)
-    able, states = events.able(flown.state.event_time_s), list[PhaseState]()
-    active = before.active
-    for role, state, part, done in zip(roles, phases, flown.parts, flown.done, strict=True):
-        done = done & able & (mission.phase_of[number] == role.number)
-        active = active & ~(done & (before.around.height_m < RESTING_HEIGHT_M))
-        local, rank = jnp.asarray(role.place.local), jnp.asarray(role.place.rank)
-        done_s = state.done_s.at[rank].min(jnp.where(done[local], now, jnp.inf))
-        states.append(replace(_with_part(state, role, part), done_s=done_s))
-    after = replace(flown.state, active=active)
-    if group.counter is not None and before.counter is not None:
-        counter = _counted(world, group.counter, group, mission.world.key, first, flown)
-        after = replace(after, counter=counter)
-    return after, tuple(states)
-
-
 def _fly(
-    world: World,
-    plan: Plan,
-    mission: MissionState,
-    number: int,
-    roles: Sequence[_Role],
-    collided: jax.Array,
-    before: GroupState,
-    phases: tuple[PhaseState, ...],
+    world: World, plan: Plan, mission: MissionState, number: int, roles: Sequence[_Role], collided: jax.Array
 ) -> _Flown:
     """The vehicles of a group, each by itself."""
-    group, timing, first = world.groups[number], world.timing, mission.world.clock.tick
+    group, before, timing = world.groups[number], mission.world.groups[number], world.timing
     reading = None if before.counter is None else before.counter.reading
-    belief = shared_belief(plan, mission.belief)
-    keys, now = tuple(phase_key(role.phase, mission.world.key) for role in roles), now_s(world, mission.world)
-
-    def one(
-        params: Any, limits: Limits, state: GroupState, collided: jax.Array, reading: Any, told: Any,
-        member: jax.Array, in_phase: jax.Array, given: tuple[Any, ...], parts: tuple[_Part, ...],
-    ) -> _Flown:  # fmt: skip
-        state = record_events(world, group.kind, now, params, limits, state, collided)
-
-        def view(state: GroupState, tick: jax.Array, latest: Any) -> View:
-            own = view_of(group, params, limits.battery_j, state, latest, told)
-            return replace(own, time_s=tick * jnp.float32(timing.control_period_s), belief=belief)
-
-        def tick(carry: Any, _: None) -> tuple[Any, None]:
-            step, state, parts, seen = carry
-            at = first + step
-            latest = None if reading is None else replace(reading, fresh=reading.fresh & (step == 0))
-            known, commands, kept = view(state, at, latest), [], []
-            for role, task, part, key in zip(roles, given, parts, keys, strict=True):
-                follows = in_phase == role.number
-                key = jax.random.fold_in(jax.random.fold_in(key, at), member)
-                part, command = _act(role, task, part, known, key, at, follows)
-                commands.append((follows, command))
-                kept.append(part)
-            command = chosen(group, params, state.vehicle, commands)
-            state = with_move(state, move(world, group.kind, params, state, command))
-            seen = _noted(group, first, at + 1, seen, state.vehicle.body)
-            return (step + 1, state, tuple(kept), seen), None
-
-        seen = tuple(state.vehicle.body for _ in range(_evaluations(group, timing.judge_ticks)))
-        start = (jnp.int32(0), state, parts, seen)
-        (_, state, parts, seen), _ = jax.lax.scan(tick, start, None, length=timing.judge_ticks)
-        last = view(state, first + timing.judge_ticks, reading)
-        done = tuple(_done(role, task, part, last) for role, task, part in zip(roles, given, parts, strict=True))
-        return _Flown(state=state, parts=parts, done=done, seen=seen)
-
-    # what a place leaves out is filled with a copy of one of its vehicles: a phase's arrays then have the group's size
-    spread = [partial(_spread, group.size, role.place) for role in roles]
+    first, running = mission.world.clock.tick, mission.world.clock.running[number]
+    shared = _Shared(
+        first=first,
+        now_s=now_s(world, mission.world),
+        belief=shared_belief(plan, mission.belief),
+        keys=tuple(phase_key(role.phase, mission.world.key) for role in roles),
+    )
     given, parts = [], []
-    for role, state, fill in zip(roles, phases, spread, strict=True):
-        task = tasks(world, plan, role.phase, role.place, mission.phases[role.number].path)
+    for role in roles:
+        phase = mission.phases[role.number]
+        # what a place leaves out is filled with a copy of one of its vehicles: arrays then have the group's size
+        fill = partial(_spread, group.size, role.place)
+        task = tasks(world, plan, role.phase, role.place, phase.path)
         own = replace(task, settings=None, site=None, params=None)  # type: ignore[arg-type]
         given.append(replace(fill(own), settings=task.settings, site=task.site, params=group.params))
-        held = None if state.held is None else fill(state.held[role.phase.places.index(role.place)])
-        parts.append(_Part(memory=fill(rows(state.memory, role.place.rank)), held=held))
+        held = None if phase.held is None else fill(phase.held[role.phase.places.index(role.place)])
+        parts.append(_Part(memory=fill(rows(phase.memory, role.place.rank)), held=held))
+
+    def one(*vehicle: Any) -> _Flown:
+        rests = partial(_rests, group, timing.judge_ticks)
+        flies = partial(_one, world, group, roles, shared)
+        return jax.lax.cond(running, flies, rests, *vehicle)  # inside, where a kernel branches at no cost
+
     every = over_vehicles(
-        one, in_axes=(0, 0, 0, 0, 0, 0, 0, 0, (TASK_AXES,) * len(roles), 0), layout=world.layout, unroll=1
-    )
+        one, in_axes=(0, 0, 0, 0, 0, 0, 0, 0, (TASK_AXES,) * len(roles), 0), layout=world.layout, unroll=1,
+        returned=(2, 9),
+    )  # fmt: skip
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
     flown: _Flown = every(
         group.params, group.limits, seen, collided, reading, heard_by(world, mission.world, number), group.member,
         mission.phase_of[number], tuple(given), tuple(parts),
     )  # fmt: skip
-    return replace(flown, state=replace(flown.state, counter=before.counter))
+    return flown
+
+
+@pytree
+class _Shared:
+    """What all vehicles of a group share in a judging period."""
+
+    first: jax.Array  # [] int32: control periods before it
+    now_s: jax.Array  # [] at its beginning
+    belief: Belief | None
+    keys: tuple[jax.Array, ...]  # of the phases' policies
+
+
+def _rests(group: Group, ticks: int, params: Any, limits: Limits, state: GroupState, *others: Any) -> _Flown:
+    """One vehicle of a group that has no part in the mission now."""
+    *_, parts = others
+    never = tuple(jnp.float32(jnp.inf) for _ in parts)
+    return _Flown(state=state, parts=parts, done_s=never, seen=_not_seen(group, ticks, state))
+
+
+def _one(
+    world: World, group: Group, roles: Sequence[_Role], shared: _Shared,
+    params: Any, limits: Limits, state: GroupState, collided: jax.Array, reading: Reading | None, told: Heard | None,
+    member: jax.Array, in_phase: jax.Array, given: tuple[Task, ...], parts: tuple[_Part, ...],
+) -> _Flown:  # fmt: skip
+    """One vehicle through the control periods of a judging period."""
+    timing = world.timing
+    period_s = jnp.float32(timing.control_period_s)
+    state = record_events(world, group.kind, shared.now_s, params, limits, state, collided)
+
+    def view(state: GroupState, tick: jax.Array, latest: Reading | None) -> View:
+        own = view_of(group, params, limits.battery_j, state, latest, told)
+        return replace(own, time_s=tick * period_s, belief=shared.belief)
+
+    def tick(carry: Any, _: None) -> tuple[Any, None]:
+        step, state, parts, seen = carry
+        at = shared.first + step
+        latest = None if reading is None else replace(reading, fresh=reading.fresh & (step == 0))
+        known, commands, kept = view(state, at, latest), [], []
+        for role, task, part, key in zip(roles, given, parts, shared.keys, strict=True):
+            follows = in_phase == role.number
+            key = jax.random.fold_in(jax.random.fold_in(key, at), member)
+            part, command = _act(role, task, part, known, key, at, follows)
+            commands.append((follows, command))
+            kept.append(part)
+        command = chosen(group, params, state.vehicle, commands)
+        state = with_move(state, move(world, group.kind, params, state, command))
+        seen = _noted(group, shared.first, at + 1, seen, state.vehicle.body)
+        return (step + 1, state, tuple(kept), seen), None
+
+    start = (jnp.int32(0), state, parts, _not_seen(group, timing.judge_ticks, state))
+    (_, state, parts, seen), _ = jax.lax.scan(tick, start, None, length=timing.judge_ticks)
+    after = shared.first + timing.judge_ticks
+    last, able = view(state, after, reading), events.able(state.event_time_s)
+    active, done_s = state.active, []
+    for role, task, part in zip(roles, given, parts, strict=True):
+        done = _done(role, task, part, last) & able & (in_phase == role.number)
+        active = active & ~(done & (state.around.height_m < RESTING_HEIGHT_M))
+        done_s.append(jnp.where(done, after * period_s, jnp.inf))
+    return _Flown(state=replace(state, active=active), parts=parts, done_s=tuple(done_s), seen=seen)
 
 
 def _spread(size: int, place: Place, tree: Any) -> Any:
@@ -235,21 +236,24 @@ def _done(role: _Role, task: Any, part: _Part, view: View) -> jax.Array:
     return role.policy.done(task, part.memory, view) if hasattr(role.policy, "done") else jnp.array(False)
 
 
-def _with_part(state: PhaseState, role: _Role, part: _Part) -> PhaseState:
+def _with_part(state: PhaseState, role: _Role, part: _Part, done_s: jax.Array) -> PhaseState:
     """The phase with what its vehicles in one group carry."""
+    local, rank = role.place.local, role.place.rank
+    done = jnp.minimum(rows(state.done_s, rank), rows(done_s, local))
+    state = replace(state, done_s=set_rows(state.done_s, rank, done))
     if role.waits:
         return state
-    local, held = role.place.local, state.held
-    memory = set_rows(state.memory, role.place.rank, rows(part.memory, local))
+    memory, held = set_rows(state.memory, rank, rows(part.memory, local)), state.held
     if held is not None:
         here = role.phase.places.index(role.place)
         held = (*held[:here], rows(part.held, local), *held[here + 1 :])
     return replace(state, memory=memory, held=held)
 
 
-def _evaluations(group: Group, ticks: int) -> int:
-    """How often a detector's rate can be due in so many control periods."""
-    return 0 if group.counter is None else -(-ticks // group.counter.ticks)
+def _not_seen(group: Group, ticks: int, state: GroupState) -> tuple[RigidState, ...]:
+    """Room for where a vehicle is when its detector's rate is due in so many control periods."""
+    times = 0 if group.counter is None else -(-ticks // group.counter.ticks)
+    return tuple(state.vehicle.body for _ in range(times))
 
 
 def _noted(
@@ -263,26 +267,23 @@ def _noted(
     return tuple(jax.tree.map(partial(jnp.where, due & (place == k)), body, before) for k, before in enumerate(seen))
 
 
-def _counted(
-    world: World,
-    counter: Counter,
-    group: Group,
-    key: jax.Array,
-    first: jax.Array,
-    flown: _Flown,
-) -> CounterState:
-    """The group's counters with the evaluations of a judging period that began after control period ``first``."""
-    timing, state = world.timing, flown.state.counter
-    assert state is not None
-    measuring = flown.state.active & events.able(flown.state.event_time_s)
-    state = unread(state)
+def _counted(world: World, mission: MissionState, number: int, flown: _Flown) -> GroupState:
+    """The group with its detectors after a judging period."""
+    group, counter_state = world.groups[number], mission.world.groups[number].counter
+    counter, state = group.counter, flown.state
+    if counter is None or counter_state is None:
+        return state
+    timing, first = world.timing, mission.world.clock.tick
+    measuring = state.active & events.able(state.event_time_s)
+    counter_state = unread(counter_state)
     for place, body in enumerate(flown.seen):
         tick = (first // counter.ticks + 1 + place) * counter.ticks
-        state = count(
-            counter, state, body, measuring, group.member, world.site, world.sources, key, tick,
-            timing.control_period_s, tick <= first + timing.judge_ticks,
+        due = mission.world.clock.running[number] & (tick <= first + timing.judge_ticks)
+        counter_state = count(
+            counter, counter_state, body, measuring, group.member, world.site, world.sources, mission.world.key, tick,
+            timing.control_period_s, due,
         )  # fmt: skip
-    return state
+    return replace(state, counter=counter_state)
 
 
 __all__ = ["frame"]

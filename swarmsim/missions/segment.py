@@ -22,20 +22,17 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     timing = world.timing
     period_s = jnp.float32(timing.control_period_s)
 
-    def judged(moving: MissionState, _: None) -> tuple[MissionState, tuple[Sampled | None, ...]]:
+    def judged(moving: MissionState, _: None) -> tuple[MissionState, tuple[Any, Any]]:
         began = now_of(moving, timing.control_period_s)
         moving = _moving(frame(world, plan, _whole(mission, moving)))
-        return moving, _samples(moving, began + 0.5 * period_s)
+        return moving, (_poses(moving), _samples(moving, began + 0.5 * period_s))
 
-    def logged(moving: MissionState, _: None) -> tuple[MissionState, tuple[Any, Any]]:
-        moving, samples = jax.lax.scan(judged, moving, None, length=timing.log_ticks // timing.judge_ticks)
-        return moving, (_poses(moving), samples)
-
-    logs = timing.decision_ticks // timing.log_ticks
+    every, logs = timing.log_ticks // timing.judge_ticks, timing.decision_ticks // timing.log_ticks
     first = mission.world.clock.tick
-    moved, (tracks, samples) = jax.lax.scan(logged, _moving(mission), None, length=logs)
+    # one loop, or the arrays that all passes share would be copied at the beginning of every inner one
+    moved, (tracks, samples) = jax.lax.scan(judged, _moving(mission), None, length=every * logs)
+    tracks = jax.tree.map(lambda x: x[every - 1 :: every], tracks)
     mission = _whole(mission, moved)
-    samples = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
     mission = _learned(world, plan, mission, samples)
     mission, signals = decide(world, plan, mission)
     ends = first + timing.log_ticks * (1 + jnp.arange(logs))

@@ -6,7 +6,7 @@ Nuclides, materials and detectors are files in ``configs``; the code names none 
 from swarmsim.radiation.detector import KINDS, Detector, Source, build_detector, restrict
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.library import Library, load_library
-from swarmsim.radiation.rate import draw_counts, line_rates, net_rate, observed_rate, spectrum_rate
+from swarmsim.radiation.rate import draw_counts, exposure_of, line_rates, net_rate, observed_rate, spectrum_rate
 
 __all__ = [
     "KINDS",
@@ -16,6 +16,7 @@ __all__ = [
     "Source",
     "build_detector",
     "draw_counts",
+    "exposure_of",
     "identify",
     "line_rates",
     "load_library",

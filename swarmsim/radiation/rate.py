@@ -81,16 +81,20 @@ def observed_rate(detector: Detector, net_cps: jax.Array) -> jax.Array:
     return rate * jnp.exp(-rate * detector.paralyzable_s) / (1.0 + rate * detector.non_paralyzable_s)
 
 
+def exposure_of(detector: Detector, live_s: jax.Array | float) -> jax.Array:
+    """Exposure [] in s that the counts of a live time of ``live_s`` [] stand for.
+
+    ``physical``: the live time. ``paper_ideal``: as of the Gazebo plugin, whose every message represents one second
+    whatever the message rate.
+    """
+    return jnp.asarray(live_s if detector.kind == "physical" else 1.0, jnp.float32)
+
+
 def draw_counts(
     detector: Detector, key: jax.Array, mean_observed_cps: jax.Array, live_s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts of one measurement and the exposure in s that they represent, both [].
-
-    ``physical``: Poisson counts over the live time ``live_s``. ``paper_ideal``: as the Gazebo plugin, Poisson(rate) for
-    every message, which represents one second whatever the message rate.
-    """
-    exposure = jnp.asarray(live_s, jnp.float32) if detector.kind == "physical" else jnp.ones_like(mean_observed_cps)
-    exposure = jnp.broadcast_to(exposure, jnp.shape(mean_observed_cps))
+    """Counts of one measurement and the exposure in s that they represent, both []: Poisson(rate x exposure)."""
+    exposure = exposure_of(detector, live_s)
     return poisson(key, mean_observed_cps * exposure), exposure
 
 

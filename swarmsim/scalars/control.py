@@ -99,7 +99,7 @@ def _scan(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[
         array, mapped = interpreter.put_together(value, variable.aval)
         columns.append(interpreter.graph.vary(jnp.moveaxis(array, 1, 0) if mapped else jnp.asarray(array)))
     first = _dump_all(interpreter, carry, carry_avals, carry_flags)
-    last, stacked = lax.scan(step, first, columns, p["length"], reverse=p["reverse"], unroll=p["unroll"])
+    last, stacked = interpreter.loop(step, first, columns, p)
     queue, results = list(stacked), _load_all(interpreter, last, carry_avals, carry_flags)
     for variable, aval, mapped in zip(equation.outvars[len(carry) :], out_avals, out_flags, strict=True):
         results.append(_history(interpreter, queue, variable.aval, aval, mapped))

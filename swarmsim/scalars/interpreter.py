@@ -176,6 +176,10 @@ class Interpreter:
             return array
         return self.graph.vary(lax.broadcast(jnp.asarray(array), (self.graph.size,)))
 
+    def loop(self, step: Callable[..., Any], first: list[Any], columns: list[Any], params: Any) -> Any:
+        """`jax.lax.scan` with the parameters of the primitive."""
+        return lax.scan(step, first, columns, params["length"], reverse=params["reverse"], unroll=params["unroll"])
+
     # What loops and branches carry: a scalar of each small value, and the large ones whole.
 
     def dump(self, value: Value, aval: Any, mapped: bool) -> list[Any]:

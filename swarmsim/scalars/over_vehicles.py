@@ -5,7 +5,8 @@ pass intermediates through memory. Here every small array of the function is tak
 that nearly everything is elementwise and is fused.
 """
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from typing import Any, Literal
 
@@ -20,7 +21,7 @@ from swarmsim.scalars.program import Program, on_cpu
 Layout = Literal["scalars", "vmap"]
 LAYOUTS = ("scalars", "vmap")
 _ARRANGED: dict[str, Callable[..., Any]] = {
-    "cpu": on_cpu,
+    "cpu": lambda program, size, mapped, _: on_cpu(program, size, mapped),
     "gpu": on_gpu,
     "gpu, interpreted": partial(on_gpu, interpret=True),  # for tests of the kernels
 }
@@ -32,6 +33,7 @@ def over_vehicles(
     layout: Layout = "scalars",
     *,
     unroll: int = UNROLL,
+    returned: Sequence[int] = (),
     platform: str | None = None,
 ) -> Callable[..., Any]:
     """`jax.vmap` of a function of one vehicle, by default as operations on scalars [N].
@@ -51,6 +53,8 @@ def over_vehicles(
             Keyword arguments are mapped over axis 0. All results have the vehicles' axis in front.
         layout: ``scalars``, or ``vmap`` for `jax.vmap` itself.
         unroll: longest `jax.lax.scan` inside ``function`` that is written out; longer ones carry scalars.
+        returned: numbers of the arguments, all of them mapped, that come back as the first results, leaf for leaf: a
+            kernel of a GPU then writes them in place, which saves a loop around it a copy.
         platform: that the program will run on, by default JAX's own; see `swarmsim.scalars.program.on_cpu`.
 
     Raises:
@@ -76,7 +80,9 @@ def over_vehicles(
         program, arrays, structure = _program(function, tree, moved, varied, unroll)
         of_vehicle = [False] * (len(arrays) - sum(varied)) + [True] * sum(varied)
         arranged = _ARRANGED.get(platform or jax.default_backend())
-        evaluate = arranged(program, size, of_vehicle) if arranged else partial(program.evaluate, size, of_vehicle)
+        evaluate = partial(program.evaluate, size, of_vehicle)
+        if arranged:
+            evaluate = arranged(program, size, of_vehicle, _places(args, returned, leaf_axes, len(arrays)))
         return jax.tree.unflatten(structure, evaluate(*arrays))
 
     return mapped
@@ -91,6 +97,14 @@ def _leaf_axes(axes: tuple[Any, ...], args: tuple[Any, ...]) -> list[int | None]
 
     jax.tree.map(add, axes, args, is_leaf=lambda x: x is None)
     return found
+
+
+def _places(args: Sequence[Any], returned: Sequence[int], axes: Sequence[int | None], arrays: int) -> list[int]:
+    """Where the leaves of some arguments stand among a program's arrays, of which the mapped leaves are the last."""
+    first = arrays - sum(axis is not None for axis in axes)
+    ends = [0, *itertools.accumulate(len(jax.tree.leaves(arg)) for arg in args)]
+    leaves = [leaf for number in returned for leaf in range(ends[number], ends[number + 1])]
+    return [first + sum(axis is not None for axis in axes[:leaf]) for leaf in leaves]
 
 
 def _vehicles(leaves: list[Any], axes: list[int | None]) -> int:

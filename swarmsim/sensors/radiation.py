@@ -9,7 +9,7 @@ from swarmsim import randomness
 from swarmsim.physics.rotations import rotate
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.rate import draw_counts, net_rate, observed_rate
+from swarmsim.radiation.rate import draw_counts, exposure_of, net_rate, observed_rate
 from swarmsim.site import Site, path_lengths
 from swarmsim.vehicles.state import RigidState
 
@@ -128,46 +128,57 @@ def count(
     """
     # Across the branches go the key's bits: JAX (0.10.1) cannot take the gradient of a scan whose `cond` keeps a key.
     bits, impl = jax.random.key_data(key), jax.random.key_impl(key)
-
-    def finish(state: CounterState) -> CounterState:
-        return _read_out(counter, state, member, jax.random.wrap_key_data(bits, impl=impl), tick, control_period_s)
-
-    def evaluate(state: CounterState) -> CounterState:
-        state = _evaluated(counter, state, body, active, site, sources)
-        if counter.evaluations == 1:
-            return finish(state)
-        return jax.lax.cond(tick % (counter.ticks * counter.evaluations) == 0, finish, lambda s: s, state)
-
-    return jax.lax.cond(due, evaluate, lambda s: s, state)
-
-
-def _evaluated(
-    counter: Counter, state: CounterState, body: RigidState, active: jax.Array, site: Site, sources: Source
-) -> CounterState:
-    """The sums with one more evaluation of the rate."""
+    ends = tick % (counter.ticks * counter.evaluations) == 0
     centre = body.position_m + rotate(body.quaternion, counter.mount_position_m)
     axis = rotate(body.quaternion, counter.mount_axis)
-    net = jax.vmap(lambda place, along: source_rate(site, counter.detector, sources, place, along))(centre, axis)
-    return replace(
+    none = jnp.zeros_like(state.rate_cps)
+
+    def draw(rate_cps: jax.Array) -> jax.Array:
+        key = jax.random.wrap_key_data(bits, impl=impl)
+        return _drawn(counter, rate_cps, member, key, tick, control_period_s)
+
+    def evaluate() -> tuple[jax.Array, jax.Array]:
+        """Observed rate [U], and counts [U] if the exposure ends now."""
+        rate = jax.vmap(lambda place, along: source_rate(site, counter.detector, sources, place, along))(centre, axis)
+        rate = observed_rate(counter.detector, rate)
+        total = state.rate_cps + rate
+        counts = draw(total) if counter.evaluations == 1 else jax.lax.cond(ends, draw, lambda _: none, total)
+        return rate, counts
+
+    # Little goes across the branches: an accelerator copies each array.
+    rate, counts = jax.lax.cond(due, evaluate, lambda: (none, none))
+    summed = replace(
         state,
-        rate_cps=state.rate_cps + observed_rate(counter.detector, net),
+        rate_cps=state.rate_cps + rate,
         position_m=state.position_m + centre,
         velocity_m_s=state.velocity_m_s + body.velocity_m_s,
         axis=state.axis + axis,
         used=state.used + active,
     )
+    read = _read_out(counter, summed, counts, tick, control_period_s)
+    return jax.tree.map(
+        lambda ended, more, before: jnp.where(due, jnp.where(ends, ended, more), before), read, summed, state
+    )
+
+
+def _drawn(
+    counter: Counter, rate_cps: jax.Array, member: jax.Array, key: jax.Array, tick: jax.Array, control_period_s: float
+) -> jax.Array:
+    """Counts [U] of an exposure with the sum ``rate_cps`` [U] over its evaluations."""
+    live_s = jnp.float32(counter.ticks * counter.evaluations * control_period_s)
+    keys = randomness.per_vehicle(randomness.consumer(key, "counts"), tick, member)
+    mean = jax.lax.stop_gradient(rate_cps / counter.evaluations)
+    return jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, live_s)[0])(keys, mean)
 
 
 def _read_out(
-    counter: Counter, state: CounterState, member: jax.Array, key: jax.Array, tick: jax.Array, control_period_s: float
+    counter: Counter, state: CounterState, counts: jax.Array, tick: jax.Array, control_period_s: float
 ) -> CounterState:
-    """Draw the counts of a completed exposure and begin the next one."""
+    """The reading of a completed exposure, and the beginning of the next one."""
     n, vehicles = counter.evaluations, state.used.shape[0]
     live_s = jnp.float32(counter.ticks * n * control_period_s)
-    keys = randomness.per_vehicle(randomness.consumer(key, "counts"), tick, member)
-    draw = jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, live_s))
     mean = state.rate_cps / n
-    counts, exposure = draw(keys, jax.lax.stop_gradient(mean))
+    exposure = jnp.broadcast_to(exposure_of(counter.detector, live_s), (vehicles,))
     norm = jnp.sqrt(jnp.sum(state.axis**2, axis=-1, keepdims=True) + 1e-12)
     reading = Reading(
         time_s=jnp.broadcast_to(tick * jnp.float32(control_period_s), (vehicles,)),

@@ -42,7 +42,7 @@ def look_around(world: World, state: WorldState) -> tuple[WorldState, list[jax.A
     number = state.clock.tick // world.timing.judge_ticks
     gusts = randomness.consumer(state.key, "gusts")
     around = [
-        jax.lax.cond(running, partial(_refreshed, world, group, gusts, number), lambda _, old: old, g.vehicle, g.around)
+        _refreshed(world, group, gusts, number, running, g)
         for running, group, g in zip(state.clock.running, world.groups, state.groups, strict=True)
     ]
     groups = tuple(replace(g, around=new) for g, new in zip(state.groups, around, strict=True))
@@ -67,12 +67,12 @@ def record_events(
 
 
 def _refreshed(
-    world: World, group: Group, gusts: jax.Array, number: jax.Array, vehicles: Any, around: Surroundings
+    world: World, group: Group, gusts: jax.Array, number: jax.Array, running: jax.Array, state: GroupState
 ) -> Surroundings:
-    """What is around a group's vehicles, with ground, height and wind where they are now."""
+    """What is around a group's vehicles, with ground, height and wind where they are now if it is running."""
     kind = KINDS[group.kind]
 
-    def one(noise: jax.Array | None, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
+    def anew(noise: jax.Array | None, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
         body = vehicle.body
         ground = ground_below(world.site, body.position_m)
         height = kind.height(params, vehicle, ground)
@@ -90,9 +90,12 @@ def _refreshed(
         wind = steady + air.gusts * gust_velocity(gust, air.speed_m_s, air.from_rad, above)
         return replace(around, ground=ground, height_m=height, gust=gust, wind_m_s=wind)
 
+    def one(noise: jax.Array | None, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
+        return jax.lax.cond(running, anew, lambda *given: given[-1], noise, params, vehicle, around)
+
     noise = jax.vmap(gust_noise)(randomness.per_vehicle(gusts, number, group.member)) if kind.FLIES else None
     every = over_vehicles(one, layout=world.layout, unroll=1)
-    refreshed: Surroundings = every(noise, group.params, vehicles, around)
+    refreshed: Surroundings = every(noise, group.params, state.vehicle, state.around)
     return refreshed
 
 

@@ -11,7 +11,7 @@ import pytest
 from swarmsim.config.errors import InputError
 from swarmsim.physics.rotations import from_yaw
 from swarmsim.radiation.rate import observed_rate
-from swarmsim.sensors.radiation import Counter, count, counter_start, source_rate
+from swarmsim.sensors.radiation import Counter, count, counter_start, source_rate, unread
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world.build import detector_models
 from tests.world.worlds import ROVERS, TICK_S, UAVS, begin, fly, row, scenario, stay, team, world
@@ -61,8 +61,9 @@ def sampled(field, way, active, key):
     def tick(state, x):
         number, body, active = x
         state = count(
-            group.counter, state, body, active, member, field.site, field.sources, key, number, jnp.float32(TICK_S)
-        )
+            group.counter, unread(state), body, active, member, field.site, field.sources, key, number,
+            jnp.float32(TICK_S), number % EVERY == 0,
+        )  # fmt: skip
         return state, (state.reading, state.expected_counts)
 
     return jax.lax.scan(tick, counter_start(2), (jnp.arange(1, TICKS + 1), way, active))[1]
@@ -147,8 +148,8 @@ def test_the_draw_depends_on_the_vehicles_number_and_not_on_its_company(field, w
     def alone(field, way):
         def tick(state, x):
             state = count(
-                counter, state, x[1], jnp.ones(1, bool), jnp.array([7]), field.site, field.sources, jax.random.key(0),
-                x[0], jnp.float32(TICK_S),
+                counter, unread(state), x[1], jnp.ones(1, bool), jnp.array([7]), field.site, field.sources,
+                jax.random.key(0), x[0], jnp.float32(TICK_S), x[0] % EVERY == 0,
             )  # fmt: skip
             return state, state.reading
 
