@@ -1,5 +1,6 @@
 """One segment of a mission: from one decision to the next, and what was decided."""
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -22,21 +23,38 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     timing = world.timing
     period_s = jnp.float32(timing.control_period_s)
 
-    def judged(moving: MissionState, _: None) -> tuple[MissionState, tuple[Any, Any]]:
+    def judged(moving: MissionState, _: None) -> tuple[MissionState, jax.Array]:
         began = now_of(moving, timing.control_period_s)
         moving = _moving(frame(world, plan, _whole(mission, moving)))
-        return moving, (_poses(moving), _samples(moving, began + 0.5 * period_s))
+        return moving, _packed((_poses(moving), _samples(moving, began + 0.5 * period_s)))
 
     every, logs = timing.log_ticks // timing.judge_ticks, timing.decision_ticks // timing.log_ticks
     first = mission.world.clock.tick
     # one loop, or the arrays that all passes share would be copied at the beginning of every inner one
-    moved, (tracks, samples) = jax.lax.scan(judged, _moving(mission), None, length=every * logs)
+    moved, record = jax.lax.scan(judged, _moving(mission), None, length=every * logs)
+    tracks, samples = _unpacked(record, jax.eval_shape(lambda: (_poses(mission), _samples(mission, period_s))))
     tracks = jax.tree.map(lambda x: x[every - 1 :: every], tracks)
     mission = _whole(mission, moved)
     mission = _learned(world, plan, mission, samples)
     mission, signals = decide(world, plan, mission)
     ends = first + timing.log_ticks * (1 + jnp.arange(logs))
     return mission, Log(time_s=ends * period_s, tracks=tracks, samples=samples), signals
+
+
+def _packed(tree: Any) -> jax.Array:
+    """All that is logged at a time, in one array: a loop writes each array of its record by itself."""
+    return jnp.concatenate([x.reshape(-1).astype(jnp.float32) for x in jax.tree.leaves(tree)])
+
+
+def _unpacked(record: jax.Array, tree: Any) -> Any:
+    """What was packed, with the leading axis of times; ``tree`` has the shapes and types at one time."""
+    leaves, structure = jax.tree.flatten(tree)
+    ends = [0, *itertools.accumulate(leaf.size for leaf in leaves)]
+    parts = [
+        record[:, first:last].reshape(-1, *leaf.shape).astype(leaf.dtype)
+        for first, last, leaf in zip(ends, ends[1:], leaves, strict=False)
+    ]
+    return jax.tree.unflatten(structure, parts)
 
 
 def _moving(mission: MissionState) -> MissionState:
