@@ -181,6 +181,8 @@ def _in_turn(together: int, apply: Callable[..., Any], own: Any, common: Any) ->
     if only is None:
         made = jax.lax.map(evaluate, places.reshape(-1, size))
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:missions], made)
+    if size == missions:
+        return jax.lax.cond(jnp.any(only), lambda: _chosen(only, evaluate(places), carried), lambda: carried)
     asked = jnp.sum(only)
     order = jnp.argsort(~only, stable=True)
     order = jnp.where(places < asked, order[jnp.minimum(places, missions - 1)], missions)  # the rest is dropped
@@ -196,3 +198,8 @@ def _alone(apply: Callable[..., Any], own: Any, common: Any) -> Any:
     """The function of a group of one mission, without vmap: conditions stay conditions."""
     result = apply(jax.tree.map(lambda x: x[0], own), common)
     return jax.tree.map(lambda x: jnp.asarray(x)[None], result)
+
+
+def _chosen(only: jax.Array, new: Any, old: Any) -> Any:
+    """``new`` for the missions ``only`` [B], ``old`` for the others."""
+    return jax.tree.map(lambda x, y: jnp.where(only.reshape(-1, *(1,) * (x.ndim - 1)), x, y), new, old)

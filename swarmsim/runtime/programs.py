@@ -8,6 +8,7 @@ the function traced and compiled. JAX's own compilation cache is not needed and 
 import gc
 import hashlib
 import itertools
+import operator
 import os
 import time
 import warnings
@@ -60,17 +61,18 @@ class Program:
         self._clock = clock
         self._executables: dict[Any, _Ready] = {}
         self._coming: dict[Any, Future[tuple[_Ready, Source]]] = {}  # what `prepare` has begun
-        self._last: tuple[Any, _Ready] | None = None  # the last call's marks (see `_marks`) and executable
+        self._last: tuple[_Marks, _Ready] | None = None  # the last call's marks and executable
 
     def __call__(self, *arguments: Any) -> Any:
         """The function's value, computed to the end; waiting for the executable and running are timed on the clock."""
         leaves, structure = jax.tree.flatten(arguments)
-        marks = structure, _marks(leaves), _changeable()
-        if self._last is None or self._last[0] != marks:
+        marks = _Marks(leaves, structure)
+        if self._last is None or not marks.same(self._last[0]):
             self._last = marks, self._ready(arguments)
         call, tree = self._last[1]
         start = time.perf_counter()
-        results = jax.block_until_ready(call(*leaves))
+        results = call(*leaves)
+        jax.block_until_ready(results[-1:])  # an executable's results are ready together
         self._clock.add("ran", self.name, time.perf_counter() - start)
         return jax.tree.unflatten(tree, results)
 
@@ -204,12 +206,36 @@ def _leaf(leaf: Any) -> tuple[Any, ...]:
     return kind.shape, kind.dtype, kind.weak_type, placement
 
 
-def _marks(leaves: Sequence[Any]) -> list[Any]:
-    """What `_leaf` tells, in objects that results of one program share, so that they are compared in no time."""
-    return [
-        (leaf.aval, getattr(leaf, "committed", False) and leaf.sharding) if hasattr(leaf, "aval") else _leaf(leaf)
-        for leaf in leaves
-    ]
+_PLACED = operator.attrgetter("aval", "committed", "sharding")
+
+
+class _Marks:
+    """What `_leaf` tells of the leaves of a call, in objects that results of one program share.
+
+    Whether two calls are alike is then known from the objects' identity, in no time; if these differ, the calls may
+    still be alike.
+    """
+
+    def __init__(self, leaves: Sequence[Any], structure: Any):
+        """Take the marks of ``leaves``; whatever they refer to is kept alive, but none of the arrays."""
+        self.structure, self.settings = structure, _changeable()
+        self.objects: list[Any] = []
+        self.others: list[Any] = []  # of what is no array of JAX
+        for leaf in leaves:
+            try:
+                self.objects += _PLACED(leaf)
+            except AttributeError:
+                self.others.append(_leaf(leaf))
+
+    def same(self, other: "_Marks") -> bool:
+        """Whether both are certainly marks of calls of one executable."""
+        return (
+            len(self.objects) == len(other.objects)
+            and all(map(operator.is_, self.objects, other.objects))
+            and self.others == other.others
+            and self.structure == other.structure
+            and self.settings == other.settings
+        )
 
 
 def _strongly_typed(result: Any) -> Any:

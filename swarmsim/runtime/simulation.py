@@ -249,12 +249,19 @@ class _Run:
 
 
 def _with_clock(mission: MissionState, tick: jax.Array, running: jax.Array) -> MissionState:
-    return replace(mission, world=replace(mission.world, clock=WorldClock(tick=tick, running=running)))
+    world = mission.world
+    clock, key = WorldClock(tick=tick, running=running), jax.random.wrap_key_data(world.key)
+    return replace(mission, world=replace(world, clock=clock, key=key))
 
 
 def _without_clock(mission: MissionState) -> MissionState:
-    """The mission without what all missions have in common, so that every leaf has the mission axis."""
-    return replace(mission, world=replace(mission.world, clock=None))  # type: ignore[arg-type]
+    """The mission without what all missions have in common, so that every leaf has the mission axis.
+
+    Its key goes as plain numbers: JAX calls a program that returns keys in Python, 1 ms each time.
+    """
+    world = mission.world
+    bare = replace(world, clock=None, key=jax.random.key_data(world.key))  # type: ignore[arg-type]
+    return replace(mission, world=bare)
 
 
 def _begin_mission(world: World, plan: Plan, key: jax.Array) -> tuple[MissionState, Signals]:
