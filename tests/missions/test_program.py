@@ -73,6 +73,48 @@ def test_a_users_policy_from_a_file_flies(climbing):
     np.testing.assert_allclose(asked, np.ceil(ticks / 10), atol=6)  # each 0.1 s; the last segment runs to its end
 
 
+def test_a_policy_is_asked_at_its_period_and_told_of_each_reading_once(tmp_path):
+    """Every tick; every third of them, which falls between judgements; and every second judgement."""
+    (tmp_path / "my.py").write_text(LISTEN, encoding="utf-8")
+    names = ["Tick", "Third", "Slow"]
+    vehicles = "\n".join(
+        f"  - {{name: {n}, type: tarot_t650, position_m: [-190, {40 + 9 * k}]}}" for k, n in enumerate(names)
+    )
+    phases = "\n".join(f"- {{name: p{n}, who: {n}, policy: 'my.py:{n}', time_limit_s: 2}}" for n in names)
+    simulation = swarmsim.build(swarmsim.load(written(tmp_path, "listening", vehicles, phases)))
+    batch = simulation.rollout(0)
+    ticks = sum(np.asarray(s.log.time_s).shape[-1] for s in batch.segments) * simulation.world.timing.log_ticks
+    asked, fresh = (np.array([np.asarray(p.memory[k])[0, 0] for p in batch.end.phases]) for k in ("asked", "fresh"))
+    np.testing.assert_array_equal(asked, [ticks, -(-ticks // 3), -(-ticks // 10)])
+    exposures = ticks // simulation.world.groups[0].counter.ticks
+    assert fresh[0] == exposures - 1  # the last one ended after the policy was asked for the last time
+
+
+LISTEN = '''
+import jax.numpy as jnp
+import swarmsim
+
+
+class Tick:
+    """Stand, and remember how often it was asked, and how often a reading was fresh."""
+
+    def start(self, task, key):
+        return {"asked": jnp.zeros(()), "fresh": jnp.zeros(())}
+
+    def act(self, task, memory, view, key):
+        seen = {"asked": memory["asked"] + 1.0, "fresh": memory["fresh"] + view.reading.fresh}
+        return seen, swarmsim.go_to(view.position_m)
+
+
+class Third(Tick):
+    period_s = 0.03
+
+
+class Slow(Tick):
+    period_s = 0.1
+'''
+
+
 def test_other_values_and_seeds_compile_nothing(climbing):
     climbing.rollout([0, 1, 2])
     values = {

@@ -64,13 +64,19 @@ def test_missions_side_by_side_or_in_turn_or_on_two_devices_are_each_its_own(cou
     assert len(result.sharding.device_set) == (2 if count == 4 else 1)
 
 
-def test_only_the_missions_that_are_asked_for_change():
-    missions = Batch(4, Clock())
+@pytest.mark.parametrize("together", [1, 2, 3, 8])
+@pytest.mark.parametrize("asked", ["100100", "000000", "111111", "011101"])
+def test_only_the_missions_that_are_asked_for_change(asked, together, monkeypatch):
+    """Whatever group they fall into; groups are filled with those that are asked for."""
+    monkeypatch.setattr(batch, "_together", lambda: together)
+    missions = Batch(6, Clock())
     inputs = missions.spread([of_mission(1.0)])
-    values = missions.put(np.array([10.0, 20.0, 30.0, 40.0], np.float32))
-    asked = missions.put(np.array([True, False, False, True]))
-    result = missions.run("some", grown, [inputs], values, (np.float32(0.5),), only=asked)
-    np.testing.assert_array_equal(result, [alone(1.0, 10.0), 20.0, 30.0, alone(1.0, 40.0)])
+    values = np.arange(10.0, 70.0, 10.0, dtype=np.float32)
+    chosen = np.array([c == "1" for c in asked])
+    name = f"some {together}"
+    result = missions.run(name, grown, [inputs], missions.put(values), (np.float32(0.5),), only=missions.put(chosen))
+    expected = [alone(1.0, v) if c else v for v, c in zip(values, chosen, strict=True)]
+    np.testing.assert_array_equal(result, expected)
 
 
 def test_other_values_need_no_other_program():

@@ -1,0 +1,125 @@
+"""A program as one kernel of a GPU, interpreted here: what it reads and writes, and what is left to XLA."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax import lax
+
+from swarmsim.scalars import over_vehicles
+from tests.control.test_multirotor import params_of
+from tests.scalars.mapped import MISSIONS, RASTER, N, assert_alike, numbers, x3
+from tests.scalars.test_composed import controlled, fleet
+
+in_kernel = partial(over_vehicles, platform="gpu, interpreted")
+LONG = numbers(30, 2, seed=9)  # of every vehicle, too long to be taken apart
+
+
+def kernels_in(function, *args):
+    """How many kernels a function calls."""
+    return str(jax.make_jaxpr(function)(*args)).count("pallas_call[")
+
+
+def looked_up(x, long, shared, raster):
+    """Reads at places that are known, and at places that depend on the vehicle."""
+    at = jnp.clip(jnp.int32(4.0 * x[0]), 0, 27)
+    part = lax.dynamic_slice(long, (at, 0), (2, 2))
+    corner = raster[jnp.int32(x[1]) % 20, jnp.int32(x[2]) % 30]
+    beyond = raster[jnp.int32(100.0 * x[2]), 3]  # jnp fills what is outside
+    return {"part": part, "last": long[-1], "sum": shared @ x, "corner": corner, "beyond": jnp.nan_to_num(beyond)}
+
+
+def repeated(x, length):
+    """A loop within a loop, and a branch that all vehicles share."""
+
+    def inner(carry, _):
+        return carry * 0.9 + jnp.sin(x), None
+
+    def outer(carry, _):
+        number, value = carry
+        value = lax.cond(number % 2 == 0, lambda v: lax.scan(inner, v, None, length)[0], lambda v: v - 1.0, value)
+        return (number + 1, value), None
+
+    return lax.scan(outer, (jnp.int32(0), x), None, 20)[0][1]
+
+
+@pytest.mark.parametrize("function", [partial(repeated, length=3), partial(repeated, length=40)])
+def test_loops_and_branches_run_inside(function):
+    mapped = in_kernel(function, unroll=1)
+    assert kernels_in(mapped, x3) == 1
+    assert_alike(jax.jit(mapped)(x3), jax.vmap(function)(x3))
+
+
+def test_reads_from_long_arrays_of_vehicles_and_of_all():
+    axes = (0, 0, None, None)
+    shared = numbers(3, seed=4)[0]
+    mapped = in_kernel(looked_up, axes)
+    assert kernels_in(mapped, x3, LONG, shared, RASTER) == 1
+    assert_alike(
+        jax.jit(mapped)(x3, LONG, shared, RASTER), jax.vmap(looked_up, axes)(x3, LONG, shared, jnp.asarray(RASTER))
+    )
+
+
+@pytest.mark.parametrize("own", [(0, 0, 0, None), (0, None, None, None), (0, None, 0, 0), (None, 0, None, None)])
+def test_missions_have_arrays_of_their_own_or_share_them(own):
+    """Of each mission and vehicle, of each mission, of each vehicle, or of all."""
+    axes = (0, 0, None, None)
+    arguments = [MISSIONS, jnp.stack([LONG, LONG + 1.0, 2.0 * LONG]), numbers(3, seed=4)[:3], jnp.stack([RASTER] * 3)]
+    given = [a if axis == 0 else a[0] for a, axis in zip(arguments, own, strict=True)]
+    found, expected = (jax.vmap(f(looked_up, axes), own) for f in (in_kernel, jax.vmap))
+    assert kernels_in(found, *given) == 1
+    assert_alike(jax.jit(found)(*given), expected(*given))
+
+
+@pytest.mark.parametrize("size", [1, 31, 33])
+def test_threads_beyond_the_last_vehicle_write_nothing(size):
+    x = jnp.linspace(-1.0, 1.0, 3 * size).reshape(size, 3)
+    assert_alike(jax.jit(in_kernel(jnp.sin))(x), jnp.sin(x))
+
+
+def test_what_comes_back_is_written_in_place_and_the_argument_is_left_to_its_owner():
+    def one(gain, state, step):
+        return {"position": state["position"] + gain * step, "flag": ~state["flag"]}, state["position"][0]
+
+    gain, step = numbers(seed=1), numbers(3, seed=2)
+    state = {"position": x3, "flag": jnp.arange(N) % 2 == 0}
+
+    def fly(f, state):
+        def body(carry, _):
+            after, first = f(gain, carry, step)
+            return after, first
+
+        return state, lax.scan(body, state, None, 7)
+
+    found, expected = (jax.jit(partial(fly, f))(state) for f in (in_kernel(one, returned=(1,)), jax.vmap(one)))
+    assert_alike(found, expected)
+    assert "input_output_aliases=((1, 0), (2, 1))" in str(
+        jax.make_jaxpr(in_kernel(lambda s: (s, 0.0), returned=(0,)))(state)
+    )
+
+
+def test_a_vehicle_with_its_controller_is_one_kernel():
+    params, state, memory, *rest = fleet()
+    tick = in_kernel(controlled("analytic"))
+    assert kernels_in(tick, params, state, memory, *rest) == 1
+    assert params.mass_kg.shape == (N,)
+    assert params_of().mass_kg.shape == ()
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: x + jax.random.normal(jax.random.key(0), (3,)),
+        lambda x: jnp.sort(jnp.tile(x, 40))[:3],
+        lambda x: jnp.tile(x, 40),  # a result that is not taken apart
+        lambda x: lax.while_loop(lambda v: v[0] > 0.1, lambda v: 0.5 * v, x),  # an end of its own for each vehicle
+        lambda x: jax.scipy.special.gammaln(jnp.abs(x) + 1.0),
+        lambda x: lax.scan(lambda c, row: (c + row, c), x[0], jnp.tile(x, 10))[0],
+    ],
+)
+def test_what_has_no_form_in_a_kernel_is_left_to_xla(function):
+    mapped = in_kernel(function)
+    assert kernels_in(mapped, x3) == 0
+    assert_alike(jax.jit(mapped)(x3), jax.vmap(function)(x3))
+    assert_alike(jax.jit(jax.vmap(mapped))(MISSIONS), jax.vmap(jax.vmap(function))(MISSIONS))
