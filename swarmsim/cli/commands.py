@@ -97,6 +97,7 @@ def bench(
     scenario: str = "recon",
     *,
     missions: Annotated[int, Parameter(validator=Number(gte=2, lte=1_000_000))] = 64,
+    fleet: Annotated[int, Parameter(validator=Number(gte=0, lte=100_000_000))] = 0,
     repeats: Annotated[int, Parameter(validator=Number(gte=1, lte=100))] = 2,
     overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
 ) -> None:
@@ -106,6 +107,7 @@ def bench(
         swarmsim bench
         swarmsim bench recon --missions 256
         swarmsim bench recon --set engine=analytic
+        swarmsim bench recon --fleet 1000000
 
     Parameters
     ----------
@@ -113,14 +115,20 @@ def bench(
         Name of a mission, or a mission file.
     missions
         How many missions the batch has; 64 by default.
+    fleet
+        Instead of missions, that many UAVs of the mission's first type, each under position control, with drag, feet
+        and wind, and nothing else: physics steps per second.
     repeats
         Rollouts of which the fastest counts; 2 by default.
     overrides
         Change a value of the mission, as path=value.
     """
-    from swarmsim.cli.run import bench_scenario
+    from swarmsim.cli.run import bench_fleet, bench_scenario
 
-    bench_scenario(scenario, missions, repeats, overrides)
+    if fleet:
+        bench_fleet(scenario, fleet, repeats, overrides)
+    else:
+        bench_scenario(scenario, missions, repeats, overrides)
 
 
 @command

@@ -105,6 +105,32 @@ def bench_scenario(name: str, missions: int, repeats: int, overrides: Sequence[s
     Console().print(table)
 
 
+def bench_fleet(name: str, vehicles: int, repeats: int, overrides: Sequence[str]) -> None:
+    """Print how fast a fleet of the mission's first type of UAV flies, by the layout of vehicles in memory."""
+    from swarmsim.config.scenario import load_scenario
+    from swarmsim.config.vehicles import Multirotor
+    from swarmsim.runtime.fleet import TICKS, measure_fleet
+    from swarmsim.scalars import LAYOUTS
+
+    scenario = load_scenario(name, overrides)
+    spec = next((spec for spec in scenario.vehicles if isinstance(spec, Multirotor)), None)
+    if spec is None:
+        raise InputError.of("has no UAV, of which a fleet could be made", path="vehicles", given=name)
+    engine = scenario.mission.engine
+    title = f"{vehicles:,} x {spec.name}, engine {engine}"
+    table = Table("parameters", "layout", "steps/s", "compilation [s]", "apart [m]", title=title, title_justify="left")
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for own in (True, False):
+        for layout in LAYOUTS:
+            speed = measure_fleet(spec, engine, vehicles, layout, own_parameters=own, ticks=TICKS, repeats=repeats)
+            table.add_row(
+                "each its own" if own else "shared", layout, f"{speed.steps_per_s:,.0f}", f"{speed.compile_s:.1f}",
+                f"{speed.apart_m:.1e}",
+            )  # fmt: skip
+    Console().print(table)
+
+
 def read_summary(folder: Path) -> dict[str, Any]:
     """The content of a run's summary."""
     summary: dict[str, Any] = json.loads((folder / SUMMARY).read_text(encoding="utf-8"))

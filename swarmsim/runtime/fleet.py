@@ -20,6 +20,7 @@ from swarmsim.vehicles.multirotor import MultirotorParams, multirotor_params
 
 TIME_STEP_S = 0.005
 SUBSTEPS = 2  # physics steps in a control period
+TICKS = 100  # control periods of a measurement: one second
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from swarmsim.scalars.kernel import on_gpu
 from swarmsim.scalars.program import Program, on_cpu
 
 Layout = Literal["scalars", "vmap"]
-LAYOUTS = ("scalars", "vmap")
+LAYOUTS: tuple[Layout, ...] = ("scalars", "vmap")
 _ARRANGED: dict[str, Callable[..., Any]] = {
     "cpu": lambda program, size, mapped, _: on_cpu(program, size, mapped),
     "gpu": on_gpu,

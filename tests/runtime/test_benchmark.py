@@ -2,6 +2,7 @@
 
 import types
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
@@ -45,3 +46,31 @@ def test_the_command_compares_one_mission_with_a_batch(
     printed = capsys.readouterr().out
     for fragment in ("8 missions", "run [s]", "real-time factor", "throughput against one at a time"):
         assert fragment in printed
+
+
+def test_the_command_measures_a_fleet_in_both_layouts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("swarmsim.runtime.fleet.TICKS", 3)
+    assert cli.main(["bench", "recon", "--fleet", "5", "--repeats", "1", "--set", "engine=analytic"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "scalars" in line or "vmap" in line]
+    assert [("each its own" in line, "scalars" in line) for line in lines] == [
+        (True, True), (True, False), (False, True), (False, False)
+    ]  # fmt: skip
+    assert all(float(line.rsplit("│", 2)[1]) < 1e-5 for line in lines)  # as far as `jax.vmap` is from the layout
+
+
+def test_a_team_of_rovers_has_no_fleet_to_measure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rover.yaml"
+    path.write_text(ROVER)
+    assert cli.main(["bench", str(path), "--fleet", "5"]) == 2
+    assert "has no UAV" in " ".join(capsys.readouterr().err.split())
+
+
+ROVER = """
+name: rover
+site: meadows
+sources: []
+vehicles: [{name: a, type: orpheus, position_m: [-190, 40]}]
+phases: [{name: wait, who: a, policy: hold, time_limit_s: 5}]
+"""
