@@ -24,6 +24,7 @@ from swarmsim.scalars.program import Program
 from swarmsim.scalars.rules import ADD, ELEMENTWISE, GE, LE, MAX, MIN, MUL, pack
 
 _NOT_IN_TRITON = frozenset({"erf", "erfc", "lgamma", "digamma", "bessel_i0e", "bessel_i1e", "round"})
+_TYPES = {"bool", "int32", "uint32", "float32"}
 _BLOCKS = ((2**17, 128), (2**14, 64), (0, 32))  # threads of a block from so many vehicles on: few fill few processors
 _WARP = 32
 _INDEX_MAX = 2**31 - 1
@@ -52,14 +53,17 @@ class _InKernel(Interpreter):
     vehicle: Any = None  # [threads] int32: number of each thread's vehicle, counted through all missions
 
     def loop(self, step: Callable[..., Any], first: list[Any], columns: list[Any], params: Any) -> Any:
-
+        """A loop, of a length that the compiler does not know, or it might write out all loops within one another."""
         return lax.fori_loop(0, params["length"] + self.nothing, lambda _, carry: step(carry, [])[0], first), []
 
     def equation(self, equation: Any, values: list[Value], wanted: list[bool]) -> Sequence[Value]:
         """Outputs of one equation."""
         name, known = equation.primitive.name, all(is_number(x) for x in values)
-        if not known and (name in _NOT_IN_TRITON or (name == "select_n" and len(values) > 3)):
-            raise NotInKernelError(name)
+        if not known and name in ELEMENTWISE:
+            types = {str(v.aval.dtype) for v in (*equation.invars, *equation.outvars)}
+            powers = name in ("pow", "integer_pow") and "float32" not in types
+            if name in _NOT_IN_TRITON or powers or not types <= _TYPES or (name == "select_n" and len(values) > 3):
+                raise NotInKernelError(f"{name} of {', '.join(sorted(types))}")
         if name in ("custom_jvp_call", "custom_vjp_call"):  # a kernel is not differentiated
             return self.run(equation.params["call_jaxpr"], values, wanted)
         return super().equation(equation, values, wanted)

@@ -115,6 +115,7 @@ def test_a_vehicle_with_its_controller_is_one_kernel():
         lambda x: jnp.tile(x, 40),  # a result that is not taken apart
         lambda x: lax.while_loop(lambda v: v[0] > 0.1, lambda v: 0.5 * v, x),  # an end of its own for each vehicle
         lambda x: jax.scipy.special.gammaln(jnp.abs(x) + 1.0),
+        lambda x: (x.astype(jnp.float16) * jnp.float16(2.0)).astype(jnp.float32),
         lambda x: lax.scan(lambda c, row: (c + row, c), x[0], jnp.tile(x, 10))[0],
     ],
 )
