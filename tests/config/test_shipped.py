@@ -62,7 +62,7 @@ def test_the_mixed_mission_has_three_types_of_uav_and_overlapping_phases() -> No
     rotors = [len(vehicle.rotors) for vehicle in scenario.vehicles if isinstance(vehicle, Multirotor)]
     assert rotors == [4, 4, 4, 6]
     assert [vehicle.kind for vehicle in scenario.vehicles].count("skid_steer") == 2
-    assert [phase.start.when for phase in scenario.mission.phases] == [None, None, "hotspot", None]
+    assert [phase.start.when for phase in scenario.mission.phases] == [None, None, "hotspot", None, None]
 
 
 def test_the_swarm_is_two_hundred_vehicles_in_one_entry() -> None:
