@@ -20,7 +20,7 @@ from swarmsim.sensors.radiation import Reading
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, World
 from swarmsim.world.radio import Heard, heard
-from swarmsim.world.state import GroupState, WorldState
+from swarmsim.world.state import GroupState, WorldState, now_s
 
 
 def policy_of(world: World, phase: Phase) -> Any:
@@ -90,7 +90,7 @@ def heard_by(world: World, state: WorldState, number: int) -> Heard | None:
 
 def views(world: World, plan: Plan, state: WorldState, belief: Any) -> tuple[View, ...]:
     """What the vehicles of each group know; leading axis U on all but the time and the belief."""
-    now = state.clock.tick * jnp.float32(world.timing.control_period_s)
+    now = now_s(world, state)
     shared, made = shared_belief(plan, belief), []
     for number, (group, g) in enumerate(zip(world.groups, state.groups, strict=True)):
         reading, seen = None if g.counter is None else g.counter.reading, replace(g, counter=None)

@@ -21,11 +21,12 @@ from swarmsim.missions.acting import (
     views,
 )
 from swarmsim.missions.plan import Phase, Plan
-from swarmsim.missions.state import NO_PHASE, MissionState, PhaseState, Signals, Survey, now_of
+from swarmsim.missions.state import NO_PHASE, MissionState, PhaseState, Signals, Survey
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Situation
 from swarmsim.world import events
 from swarmsim.world.model import World
+from swarmsim.world.state import now_s
 from swarmsim.world.step import reset
 
 
@@ -122,7 +123,7 @@ def begin_phase(world: World, plan: Plan, mission: MissionState, number: int) ->
     Its vehicles leave the phase that they were in. A vehicle whose part in the mission has ended stays out.
     """
     phase, state = plan.phases[number], mission.phases[number]
-    now = now_of(mission, world.timing.control_period_s)
+    now = now_s(world, mission.world)
     mission, target, found = _target(world, plan, phase, mission)
     path = state.path
     if phase.plans:

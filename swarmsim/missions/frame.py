@@ -38,10 +38,10 @@ from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import Reading, count, unread
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world import events
-from swarmsim.world.judge import look_around, now_s, record_events
+from swarmsim.world.judge import look_around, record_events
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.radio import Heard
-from swarmsim.world.state import GroupState
+from swarmsim.world.state import GroupState, now_s
 from swarmsim.world.step import move, with_move
 
 RESTING_HEIGHT_M = 0.1  # a vehicle whose part is done rests if it stands on the ground, else it hovers
@@ -269,12 +269,12 @@ def _noted(
 
 def _counted(world: World, mission: MissionState, number: int, flown: _Flown) -> GroupState:
     """The group with its detectors after a judging period."""
-    group, counter_state = world.groups[number], mission.world.groups[number].counter
-    counter, state = group.counter, flown.state
+    group, before = world.groups[number], mission.world.groups[number]
+    counter, counter_state, state = group.counter, before.counter, flown.state
     if counter is None or counter_state is None:
         return state
     timing, first = world.timing, mission.world.clock.tick
-    measuring = state.active & events.able(state.event_time_s)
+    measuring = before.active & events.able(state.event_time_s)
     counter_state = unread(counter_state)
     for place, body in enumerate(flown.seen):
         tick = (first // counter.ticks + 1 + place) * counter.ticks

@@ -11,8 +11,9 @@ from swarmsim.estimation import Measurements, extract_hotspots, recursive_map
 from swarmsim.estimation.windows import gather
 from swarmsim.missions.frame import frame
 from swarmsim.missions.plan import Phase, Plan, Trigger
-from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track, now_of
+from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track
 from swarmsim.world.model import World
+from swarmsim.world.state import now_s
 
 
 def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionState, Log, Signals]:
@@ -24,7 +25,7 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     period_s = jnp.float32(timing.control_period_s)
 
     def judged(moving: MissionState, _: None) -> tuple[MissionState, jax.Array]:
-        began = now_of(moving, timing.control_period_s)
+        began = now_s(world, moving.world)
         moving = _moving(frame(world, plan, _whole(mission, moving)))
         return moving, _packed((_poses(moving), _samples(moving, began + 0.5 * period_s)))
 
@@ -139,7 +140,7 @@ def _measurements(sampled: Sampled) -> Measurements:
 
 def decide(world: World, plan: Plan, mission: MissionState) -> tuple[MissionState, Signals]:
     """End phases, tell which ones are to begin, and whether the mission is over."""
-    now = now_of(mission, world.timing.control_period_s)
+    now = now_s(world, mission.world)
     hotspot = _hotspot_known(plan, mission)
     states = [_ended(world, plan, mission, number, now, hotspot) for number in range(len(plan.phases))]
     phase_of = list(mission.phase_of)

@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from swarmsim.estimation import Hotspots, RadiationMap, SourceFit
 from swarmsim.estimation.recursive_map import Binned
@@ -93,8 +92,3 @@ class Log:
     time_s: jax.Array  # [T] of the track
     tracks: tuple[Track, ...]
     samples: tuple[Sampled | None, ...]
-
-
-def now_of(state: MissionState, control_period_s: float) -> jax.Array:
-    """The mission's time [] in s."""
-    return state.world.clock.tick * jnp.float32(control_period_s)

@@ -19,6 +19,9 @@ GUST_HEIGHT_M = (10.0 * FOOT_M, 1000.0 * FOOT_M)
 AIRSPEED_MIN_M_S = 0.5
 """Least speed at which the frozen gusts pass by a vehicle that drifts with the wind."""
 
+GUST_NOISE = 5
+"""Numbers of white noise that a step of the filters takes: one along the wind, two across, two up."""
+
 
 @pytree
 class GustState:
@@ -61,8 +64,8 @@ def gust_start(key: jax.Array) -> GustState:
 
 
 def gust_noise(key: jax.Array) -> jax.Array:
-    """White noise [5] for one `gust_step`."""
-    return jax.random.normal(key, (5,))
+    """White noise [`GUST_NOISE`] for one `gust_step`."""
+    return jax.random.normal(key, (GUST_NOISE,))
 
 
 def gust_step(

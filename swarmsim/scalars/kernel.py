@@ -189,8 +189,7 @@ def _gather(interpreter: _InKernel, equation: Any, whole: Whole, operands: list[
         if not plan.clip:
             for i, last in zip(start, lasts, strict=True):
                 if is_constant(i):
-                    inside = [bool(0 <= int(i) <= last)] * len(entries)
-                    entries = [x if ok else plan.outside for x, ok in zip(entries, inside, strict=True)]
+                    entries = entries if 0 <= int(i) <= last else [plan.outside] * len(entries)
                     continue
                 low, high = graph.apply(GE, _index(i), np.int32(0)), graph.apply(LE, _index(i), np.int32(last))
                 entries = [graph.select(low, plan.outside, x) for x in entries]

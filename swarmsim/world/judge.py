@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim import randomness
-from swarmsim.physics.wind import gust_noise, gust_step, gust_velocity, steady_wind
+from swarmsim.physics.wind import GUST_NOISE, gust_noise, gust_step, gust_velocity, steady_wind
 from swarmsim.scalars import over_vehicles
 from swarmsim.world import events
 from swarmsim.world.kinds import KINDS
@@ -16,7 +16,7 @@ from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below
 from swarmsim.world.radio import broadcast
 from swarmsim.world.right_of_way import kept_aside, right_of_way
-from swarmsim.world.state import GroupState, Surroundings, WorldState
+from swarmsim.world.state import GroupState, Surroundings, WorldState, now_s
 
 
 def judge(world: World, state: WorldState) -> WorldState:
@@ -30,11 +30,6 @@ def judge(world: World, state: WorldState) -> WorldState:
         judged = over_vehicles(one, layout=world.layout, unroll=1)(group.params, group.limits, seen, hit)
         groups.append(replace(judged, counter=g.counter))
     return replace(state, groups=tuple(groups))
-
-
-def now_s(world: World, state: WorldState) -> jax.Array:
-    """The time [] of the world in s."""
-    return state.clock.tick * jnp.float32(world.timing.control_period_s)
 
 
 def look_around(world: World, state: WorldState) -> tuple[WorldState, list[jax.Array]]:
@@ -93,7 +88,10 @@ def _refreshed(
     def one(noise: jax.Array | None, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
         return jax.lax.cond(running, anew, lambda *given: given[-1], noise, params, vehicle, around)
 
-    noise = jax.vmap(gust_noise)(randomness.per_vehicle(gusts, number, group.member)) if kind.FLIES else None
+    def draw() -> jax.Array:
+        return jax.vmap(gust_noise)(randomness.per_vehicle(gusts, number, group.member))
+
+    noise = jax.lax.cond(running, draw, lambda: jnp.zeros((group.size, GUST_NOISE))) if kind.FLIES else None
     every = over_vehicles(one, layout=world.layout, unroll=1)
     refreshed: Surroundings = every(noise, group.params, state.vehicle, state.around)
     return refreshed

@@ -3,11 +3,13 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.wind import GustState
 from swarmsim.pytree import pytree
 from swarmsim.sensors.radiation import CounterState, Reading
+from swarmsim.world.model import World
 
 
 @pytree
@@ -65,6 +67,11 @@ class WorldState:
     groups: tuple[GroupState, ...]
     radio: RadioState
     crowded: jax.Array  # [] bool: more vehicles in one place than the neighbour search can hold, at any time
+
+
+def now_s(world: World, state: WorldState) -> jax.Array:
+    """The time [] of a world in s."""
+    return state.clock.tick * jnp.float32(world.timing.control_period_s)
 
 
 def mission_axes() -> WorldState:
