@@ -89,6 +89,7 @@ class Batch:
         *,
         only: Any = None,
         in_turn: bool = False,
+        donate: bool = False,
     ) -> Any:
         """``function(*inputs, carried, *common)`` of one mission, for all B at once.
 
@@ -101,37 +102,48 @@ class Batch:
             only: [B] bool. With it the function maps ``carried`` to the like, and is evaluated for those missions
                 alone, in turn; the others keep theirs.
             in_turn: one mission after the other, on an accelerator in groups of `TOGETHER`: for what fills a device.
+            donate: the result takes over the buffers of ``carried``, which is not used again: nothing that merely
+                passes through is copied.
 
         Returns:
             Its result with the mission axis on every leaf.
         """
-        program, arguments = self._call(name, function, inputs, carried, common, only, in_turn)
+        program, arguments = self._call(name, function, inputs, carried, common, only, in_turn, donate)
         return program(*arguments)
 
     def prepare(self, calls: Sequence[dict[str, Any]]) -> None:
         """Begin to load or compile the programs of future calls of `run` (its arguments by name), side by side."""
-        prepare([self._call(**({"common": (), "only": None, "in_turn": False} | call)) for call in calls])
+        defaults = {"common": (), "only": None, "in_turn": False, "donate": False}
+        prepare([self._call(**(defaults | call)) for call in calls])
 
     def _call(
-        self, name: str, function: Callable[..., Any], inputs: Any, carried: Any, common: Any, only: Any, in_turn: bool
-    ) -> tuple[Program, tuple[Any, Any]]:
+        self,
+        name: str,
+        function: Callable[..., Any],
+        inputs: Any,
+        carried: Any,
+        common: Any,
+        only: Any,
+        in_turn: bool,
+        donate: bool,
+    ) -> tuple[Program, tuple[Any, Any, Any]]:
         """The program and its arguments."""
-        shape = (name, tuple((s.structure, s.carries) for s in inputs), only is not None, in_turn)
+        shape = (name, tuple((s.structure, s.carries) for s in inputs), only is not None, in_turn, donate)
         program = self._programs.get(shape)
         if program is None:
             apply = partial(_apply, function, tuple((s.structure, s.carries) for s in inputs))
             batched = partial(_in_turn, _together()) if in_turn or only is not None else _every
             whole = self._sharded(partial(batched, apply))
-            program = self._programs[shape] = Program(name, whole, clock=self._clock)
-        own = [s.own for s in inputs], carried, only
-        return program, (own, ([s.shared for s in inputs], tuple(common)))
+            taken = (0,) if donate else ()
+            program = self._programs[shape] = Program(name, whole, clock=self._clock, donate=taken)
+        return program, (carried, ([s.own for s in inputs], only), ([s.shared for s in inputs], tuple(common)))
 
     def _sharded(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """The function of equal parts of the missions, on the devices side by side; parts do not wait for another."""
         if self._mesh is None:
             return function
         each, all_ = PartitionSpec("mission"), PartitionSpec()
-        return jax.shard_map(function, mesh=self._mesh, in_specs=(each, all_), out_specs=each, check_vma=False)
+        return jax.shard_map(function, mesh=self._mesh, in_specs=(each, each, all_), out_specs=each, check_vma=False)
 
 
 class Spread:
@@ -151,9 +163,9 @@ def _together() -> int:
     return 1 if jax.default_backend() == "cpu" else TOGETHER
 
 
-def _apply(function: Callable[..., Any], shapes: Any, own: Any, common: Any) -> Any:
+def _apply(function: Callable[..., Any], shapes: Any, carried: Any, own: Any, common: Any) -> Any:
     """The function of one mission on its unpacked arguments."""
-    (own_leaves, carried, _), (shared_leaves, arrays) = own, common
+    (own_leaves, _), (shared_leaves, arrays) = own, common
     inputs = []
     for (structure, carries), mine, shared in zip(shapes, own_leaves, shared_leaves, strict=True):
         own_part, shared_part = iter(mine), iter(shared)
@@ -162,21 +174,21 @@ def _apply(function: Callable[..., Any], shapes: Any, own: Any, common: Any) -> 
     return function(*inputs, carried, *arrays)
 
 
-def _every(apply: Callable[..., Any], own: Any, common: Any) -> Any:
+def _every(apply: Callable[..., Any], carried: Any, own: Any, common: Any) -> Any:
     """All missions in step."""
-    return jax.vmap(apply, in_axes=(0, None))(own, common)
+    return jax.vmap(apply, in_axes=(0, 0, None))(carried, own, common)
 
 
-def _in_turn(together: int, apply: Callable[..., Any], own: Any, common: Any) -> Any:
+def _in_turn(together: int, apply: Callable[..., Any], carried: Any, own: Any, common: Any) -> Any:
     """Groups of missions after one another; where only some are asked for, the groups are made up of those."""
-    _, carried, only = own
+    only = own[1]
     missions = jax.tree.leaves(carried)[0].shape[0]
     size = min(together, missions)
     places = jnp.arange(-(-missions // size) * size)
 
     def evaluate(places: jax.Array, carried: Any = carried) -> Any:
-        group = jax.tree.map(lambda x: x[jnp.minimum(places, missions - 1)], (own[0], carried, only))
-        return jax.vmap(apply, in_axes=(0, None))(group, common) if size > 1 else _alone(apply, group, common)
+        mine, theirs = jax.tree.map(lambda x: x[jnp.minimum(places, missions - 1)], (carried, own))
+        return _every(apply, mine, theirs, common) if size > 1 else _alone(apply, mine, theirs, common)
 
     if only is None:
         made = jax.lax.map(evaluate, places.reshape(-1, size))
@@ -194,9 +206,9 @@ def _in_turn(together: int, apply: Callable[..., Any], own: Any, common: Any) ->
     return jax.lax.fori_loop(0, -(-asked // size), take, carried)
 
 
-def _alone(apply: Callable[..., Any], own: Any, common: Any) -> Any:
+def _alone(apply: Callable[..., Any], carried: Any, own: Any, common: Any) -> Any:
     """The function of a group of one mission, without vmap: conditions stay conditions."""
-    result = apply(jax.tree.map(lambda x: x[0], own), common)
+    result = apply(*jax.tree.map(lambda x: x[0], (carried, own)), common)
     return jax.tree.map(lambda x: jnp.asarray(x)[None], result)
 
 

@@ -88,7 +88,8 @@ class Program:
 
     def _begin(self, threads: ThreadPoolExecutor, arguments: Sequence[Any]) -> None:
         """Obtain the executable for these arguments in the background, unless that is done or under way."""
-        situation = _situation(*jax.tree.flatten(tuple(arguments)))
+        arguments = jax.tree.map(_described, tuple(arguments))  # a call may take the arrays over meanwhile
+        situation = _situation(*jax.tree.flatten(arguments))
         if situation not in self._executables and situation not in self._coming:
             self._coming[situation] = threads.submit(self._obtain, arguments)
 
@@ -204,6 +205,12 @@ def _leaf(leaf: Any) -> tuple[Any, ...]:
     kind = jax.typeof(leaf)
     placement = leaf.sharding if getattr(leaf, "committed", False) else None
     return kind.shape, kind.dtype, kind.weak_type, placement
+
+
+def _described(leaf: Any) -> jax.ShapeDtypeStruct:
+    """All of an argument that chooses its executable."""
+    shape, dtype, weak_type, placement = _leaf(leaf)
+    return jax.ShapeDtypeStruct(shape, dtype, sharding=placement, weak_type=weak_type)
 
 
 _PLACED = operator.attrgetter("aval", "committed", "sharding")

@@ -208,14 +208,20 @@ class _Run:
             "carried": mission,
             "common": (np.int32(tick),),
             "only": self._batch.put(begin),
+            "donate": True,
         }
 
     def _advance(self, mission: MissionState, tick: int, running: np.ndarray) -> dict[str, Any]:
         """The call that runs a segment."""
         common = (np.int32(tick), np.asarray(running, bool))
         return {
-            "name": "run", "function": _segment, "inputs": self._inputs, "carried": mission, "common": common
-        }  # fmt: skip
+            "name": "run",
+            "function": _segment,
+            "inputs": self._inputs,
+            "carried": mission,
+            "common": common,
+            "donate": True,
+        }
 
     def _conclusion(self, mission: MissionState, keys: Any) -> dict[str, Any]:
         """The call that concludes the missions."""

@@ -91,3 +91,16 @@ def test_other_values_need_no_other_program():
     assert not clock.compiled
     assert not clock.loaded
     assert clock.run_s > 0.0
+
+
+@pytest.mark.parametrize("only", [False, True])
+def test_a_result_takes_over_what_it_was_made_from_only_if_told_to(only):
+    missions = Batch(3, Clock())
+    inputs = missions.spread([of_mission(2.0)])
+    kept, given = (missions.put(np.arange(3, dtype=np.float32)) for _ in range(2))
+    asked = missions.put(np.array([True, False, True])) if only else None
+    call = {"function": grown, "inputs": [inputs], "common": (np.float32(0.5),), "only": asked}
+    results = [missions.run(f"taken {only}", carried=x, donate=x is given, **call) for x in (kept, given)]
+    np.testing.assert_array_equal(*results)
+    assert (kept.is_deleted(), given.is_deleted()) == (False, True)
+    assert not any(s.is_deleted() for s in inputs.own)
