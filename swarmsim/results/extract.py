@@ -1,13 +1,13 @@
 """One mission out of a batch, as the record on the host that files, figures and recordings are made from."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 from swarmsim.estimation import SourceFit
-from swarmsim.missions.state import MissionState, Sampled
+from swarmsim.missions.state import MissionState
 from swarmsim.results.record import (
     Estimate,
     Event,
@@ -21,7 +21,7 @@ from swarmsim.results.record import (
     VehicleRecord,
 )
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
-from swarmsim.runtime.simulation import MissionBatch, Segment, Simulation
+from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.world.model import World
 
 NOTHING_SOUGHT = "nothing was sought"
@@ -113,12 +113,12 @@ def _vehicle(
 
 def _tracks(batch: MissionBatch, index: int, group: int) -> dict[str, np.ndarray]:
     """Times [T] and tracks [T, U, …] of a group; empty where it was never stepped."""
-    logged = [(s.log.time_s, track) for s in batch.segments if (track := s.log.tracks[group]) is not None]
+    logged = [(s, track) for s in batch.segments if (track := s.log.tracks[group]) is not None]
     if not logged:
         return {}
-    found = {"time_s": np.concatenate([np.asarray(time_s)[index] for time_s, _ in logged])}
+    found = {"time_s": np.concatenate([s.of(index, s.log.time_s) for s, _ in logged])}
     for name in (*TRACK, "active"):
-        found[name] = np.concatenate([np.asarray(getattr(track, name))[index] for _, track in logged])
+        found[name] = np.concatenate([s.of(index, getattr(track, name)) for s, track in logged])
     return found
 
 
@@ -133,9 +133,11 @@ def _samples(simulation: Simulation, batch: MissionBatch, index: int, phases: li
     """All valid readings in the order of time."""
     found: list[dict[str, np.ndarray]] = []
     for g, group in enumerate(simulation.world.groups):
-        for sampled in _of_group(batch.segments, g):
-            new = np.asarray(sampled.new)[index]
-            rows = {name: np.asarray(getattr(sampled, name))[index][new] for name in SAMPLE}
+        for segment in batch.segments:
+            if (sampled := segment.log.samples[g]) is None:
+                continue
+            new = segment.of(index, sampled.new)
+            rows = {name: segment.of(index, getattr(sampled, name))[new] for name in SAMPLE}
             rows["vehicle"] = np.broadcast_to(np.asarray(group.member, np.int32), new.shape)[new]
             found.append(rows)
     return samples_of(found, phases)
@@ -154,10 +156,6 @@ def samples_of(found: Sequence[Mapping[str, np.ndarray]], phases: Sequence[Phase
         count_rate_cps=rows["counts"] / rows["exposure_s"],
         **rows,
     )
-
-
-def _of_group(segments: Iterable[Segment], group: int) -> Iterable[Sampled]:
-    return (found for segment in segments if (found := segment.log.samples[group]) is not None)
 
 
 def _phase_names(vehicle: np.ndarray, time_s: np.ndarray, phases: Sequence[Phase]) -> np.ndarray:

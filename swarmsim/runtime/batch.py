@@ -6,6 +6,7 @@ all missions unless they differ.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -90,6 +91,7 @@ class Batch:
         only: Any = None,
         in_turn: bool = False,
         donate: bool = False,
+        again: "Again | None" = None,
     ) -> Any:
         """``function(*inputs, carried, *common)`` of one mission, for all B at once.
 
@@ -104,16 +106,19 @@ class Batch:
             in_turn: one mission after the other, on an accelerator in groups of `TOGETHER`: for what fills a device.
             donate: the result takes over the buffers of ``carried``, which is not used again: nothing that merely
                 passes through is copied.
+            again: evaluate the function, which then returns (carried, record, verdict), several times in one call.
 
         Returns:
-            Its result with the mission axis on every leaf.
+            Its result with the mission axis on every leaf. With ``again`` (carried, records, verdict, times): records
+            have an axis of evaluations after that of the missions, and were made ``times`` [B] times, as often for
+            each mission; the rest of their rows are zero.
         """
-        program, arguments = self._call(name, function, inputs, carried, common, only, in_turn, donate)
+        program, arguments = self._call(name, function, inputs, carried, common, only, in_turn, donate, again)
         return program(*arguments)
 
     def prepare(self, calls: Sequence[dict[str, Any]]) -> None:
         """Begin to load or compile the programs of future calls of `run` (its arguments by name), side by side."""
-        defaults = {"common": (), "only": None, "in_turn": False, "donate": False}
+        defaults = {"common": (), "only": None, "in_turn": False, "donate": False, "again": None}
         prepare([self._call(**(defaults | call)) for call in calls])
 
     def _call(
@@ -126,13 +131,16 @@ class Batch:
         only: Any,
         in_turn: bool,
         donate: bool,
+        again: "Again | None",
     ) -> tuple[Program, tuple[Any, Any, Any]]:
         """The program and its arguments."""
-        shape = (name, tuple((s.structure, s.carries) for s in inputs), only is not None, in_turn, donate)
+        shape = (name, tuple((s.structure, s.carries) for s in inputs), only is not None, in_turn, donate, again)
         program = self._programs.get(shape)
         if program is None:
             apply = partial(_apply, function, tuple((s.structure, s.carries) for s in inputs))
             batched = partial(_in_turn, _together()) if in_turn or only is not None else _every
+            if again is not None:  # parts of the batch would have to wait for one another after each
+                batched = partial(_again, again if self._mesh is None else replace(again, most=1))
             whole = self._sharded(partial(batched, apply))
             taken = (0,) if donate else ()
             program = self._programs[shape] = Program(name, whole, clock=self._clock, donate=taken)
@@ -144,6 +152,15 @@ class Batch:
             return function
         each, all_ = PartitionSpec("mission"), PartitionSpec()
         return jax.shard_map(function, mesh=self._mesh, in_specs=(each, each, all_), out_specs=each, check_vma=False)
+
+
+@dataclass(frozen=True)
+class Again:
+    """How often a function of all missions is evaluated in one call, which costs the host some milliseconds."""
+
+    most: int
+    onward: Callable[..., tuple[jax.Array, Any]]
+    """From the verdicts of all missions and the common arguments: whether [] to go on, and with which ones."""
 
 
 class Spread:
@@ -177,6 +194,31 @@ def _apply(function: Callable[..., Any], shapes: Any, carried: Any, own: Any, co
 def _every(apply: Callable[..., Any], carried: Any, own: Any, common: Any) -> Any:
     """All missions in step."""
     return jax.vmap(apply, in_axes=(0, 0, None))(carried, own, common)
+
+
+def _again(again: Again, apply: Callable[..., Any], carried: Any, own: Any, common: Any) -> Any:
+    """All missions in step, time after time."""
+    shared, first = common
+    # traced once, for its shapes and for the loop
+    once = jax.jit(lambda carried, own, shared, arrays: _every(apply, carried, own, (shared, arrays)), inline=True)
+    _, record, verdict = jax.eval_shape(once, carried, own, shared, first)
+    records = jax.tree.map(lambda x: jnp.zeros((x.shape[0], again.most, *x.shape[1:]), x.dtype), record)
+    verdict = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), verdict)
+
+    def go_on(state: Any) -> jax.Array:
+        times, wanted, *_ = state
+        return (times < again.most) & wanted
+
+    def body(state: Any) -> Any:
+        times, _, carried, arrays, records, _ = state
+        carried, record, verdict = once(carried, own, shared, arrays)
+        records = jax.tree.map(lambda whole, row: whole.at[:, times].set(row), records, record)
+        wanted, arrays = again.onward(verdict, arrays)
+        return times + 1, wanted, carried, arrays, records, verdict
+
+    start = (jnp.int32(0), jnp.array(True), carried, jax.tree.map(jnp.asarray, first), records, verdict)
+    times, _, carried, _, records, verdict = jax.lax.while_loop(go_on, body, start)
+    return carried, records, verdict, jnp.full(jax.tree.leaves(record)[0].shape[0], times)
 
 
 def _in_turn(together: int, apply: Callable[..., Any], carried: Any, own: Any, common: Any) -> Any:

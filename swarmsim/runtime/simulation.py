@@ -19,7 +19,7 @@ from swarmsim.missions.plan import Plan
 from swarmsim.missions.plan_build import build_plan, listens
 from swarmsim.missions.segment import segment
 from swarmsim.missions.state import Log, MissionState, Signals
-from swarmsim.runtime.batch import Batch, Spread, filled, layout_for
+from swarmsim.runtime.batch import Again, Batch, Spread, filled, layout_for
 from swarmsim.runtime.clock import Clock
 from swarmsim.runtime.progress import Progress, SilentProgress
 from swarmsim.scalars import Layout
@@ -30,13 +30,20 @@ from swarmsim.world.state import Clock as WorldClock
 from swarmsim.world.state import WorldState
 from swarmsim.world.step import reset
 
+AT_ONCE = 8  # decision periods that one call runs: each call costs the host 2 ms
+
 
 @dataclass(frozen=True)
 class Segment:
-    """What one segment left; arrays have the mission axis. ``log`` holds the groups that ran, None for the others."""
+    """What some decision periods in a row left."""
 
-    log: Log
-    running: np.ndarray  # [G] bool
+    log: Log  # arrays [B, periods or more, …] of the groups that ran, None for the others
+    periods: int  # how many were simulated; what follows is void
+
+    def of(self, mission: int, logged: Any) -> np.ndarray:
+        """One mission's rows [T, …] of an array of the log, all periods in one axis."""
+        rows = np.asarray(logged)[mission, : self.periods]
+        return rows.reshape(-1, *rows.shape[2:])
 
 
 @dataclass(frozen=True)
@@ -184,9 +191,9 @@ class _Run:
                 mission = batch.run(**self._beginning(int(number), mission, tick, begin[:, number]))
                 told = ()
             running = self._running(mission) if begin.any() else np.asarray(active.any(axis=0))
-            mission, log, signals = batch.run(**self._advance(mission, tick, running))
-            tick += timing.decision_ticks
-            segments.append(Segment(log=_kept(log, running), running=running))
+            mission, (log, ran), (signals, ticks), periods = batch.run(**self._advance(mission, tick, running))
+            tick = int(np.asarray(ticks)[0])
+            segments.append(_segment_of(log, np.asarray(ran)[0], int(np.asarray(periods)[0])))
             begin, active = np.asarray(signals.begin), np.asarray(signals.active)
             running_phases = np.flatnonzero(np.asarray(signals.running).any(axis=0))
             under_way = tuple(names[number] for number in running_phases)
@@ -221,6 +228,7 @@ class _Run:
             "carried": mission,
             "common": common,
             "donate": True,
+            "again": Again(AT_ONCE, _onward),
         }
 
     def _conclusion(self, mission: MissionState, keys: Any) -> dict[str, Any]:
@@ -282,9 +290,15 @@ def _begin_phase(number: int, world: World, plan: Plan, mission: MissionState, t
 
 def _segment(
     world: World, plan: Plan, mission: MissionState, tick: jax.Array, running: jax.Array
-) -> tuple[MissionState, Log, Signals]:
+) -> tuple[MissionState, tuple[Log, jax.Array], tuple[Signals, jax.Array]]:
     mission, log, signals = segment(world, plan, _with_clock(mission, tick, running))
-    return _without_clock(mission), log, signals
+    return _without_clock(mission), (log, running), (signals, tick + world.timing.decision_ticks)
+
+
+def _onward(verdict: tuple[Signals, jax.Array], _: Any) -> tuple[jax.Array, Any]:
+    """Whether all missions go on without the host, and with which clock."""
+    signals, ticks = verdict
+    return ~jnp.any(signals.begin) & ~jnp.all(signals.over), (ticks[0], jnp.any(signals.active, axis=0))
 
 
 def _conclude(world: World, plan: Plan, carried: tuple[jax.Array, MissionState]) -> Conclusion:
@@ -294,11 +308,12 @@ def _conclude(world: World, plan: Plan, carried: tuple[jax.Array, MissionState])
     return conclude(key, world, plan, known, measurements)
 
 
-def _kept(log: Log, running: np.ndarray) -> Log:
-    """The log without the groups that rested throughout."""
-    tracks = tuple(t if r else None for t, r in zip(log.tracks, running, strict=True))
-    samples = tuple(s if r else None for s, r in zip(log.samples, running, strict=True))
-    return replace(log, tracks=tracks, samples=samples)  # type: ignore[arg-type]
+def _segment_of(log: Log, ran: np.ndarray, periods: int) -> Segment:
+    """The segment without the groups that rested throughout; ``ran`` [periods or more, G]."""
+    kept = [bool(np.any(group)) for group in ran[:periods].T]
+    tracks = tuple(t if k else None for t, k in zip(log.tracks, kept, strict=True))
+    samples = tuple(s if k else None for s, k in zip(log.samples, kept, strict=True))
+    return Segment(log=replace(log, tracks=tracks, samples=samples), periods=periods)  # type: ignore[arg-type]
 
 
 __all__ = ["MissionBatch", "Segment", "Simulation"]

@@ -1,5 +1,7 @@
 """The aerial estimate against its Cramér–Rao bound, on the samples of the shipped survey as flown."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,8 +44,8 @@ def survey():
     simulation = swarmsim.build(swarmsim.load("recon", [*common, *QUICK]))
     world, plan = simulation.world, simulation.plan
     assert all(phase.in_time for phase in swarmsim.mission_record(flown, batch, 0).phases)  # every UAV has landed
-    samples = [segment.log.samples[0] for segment in batch.segments]
-    joined = jax.tree.map(lambda *parts: jnp.concatenate([part[0] for part in parts]), *samples)
+    samples = [jax.tree.map(partial(segment.of, 0), segment.log.samples[0]) for segment in batch.segments]
+    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples)
     counter = world.groups[0].counter
     rate = jax.vmap(jax.vmap(lambda place, axis: source_rate(world.site, counter.detector, world.sources, place, axis)))
     flat = jax.jit(lambda: observed_rate(counter.detector, rate(joined.position_m, joined.axis)))()

@@ -83,7 +83,7 @@ def test_a_policy_is_asked_at_its_period_and_told_of_each_reading_once(tmp_path)
     phases = "\n".join(f"- {{name: p{n}, who: {n}, policy: 'my.py:{n}', time_limit_s: 2}}" for n in names)
     simulation = swarmsim.build(swarmsim.load(written(tmp_path, "listening", vehicles, phases)))
     batch = simulation.rollout(0)
-    ticks = sum(np.asarray(s.log.time_s).shape[-1] for s in batch.segments) * simulation.world.timing.log_ticks
+    ticks = sum(s.of(0, s.log.time_s).size for s in batch.segments) * simulation.world.timing.log_ticks
     asked, fresh = (np.array([np.asarray(p.memory[k])[0, 0] for p in batch.end.phases]) for k in ("asked", "fresh"))
     np.testing.assert_array_equal(asked, [ticks, -(-ticks // 3), -(-ticks // 10)])
     exposures = ticks // simulation.world.groups[0].counter.ticks

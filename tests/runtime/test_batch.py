@@ -104,3 +104,32 @@ def test_a_result_takes_over_what_it_was_made_from_only_if_told_to(only):
     np.testing.assert_array_equal(*results)
     assert (kept.is_deleted(), given.is_deleted()) == (False, True)
     assert not any(s.is_deleted() for s in inputs.own)
+
+
+def _counted(inputs, state, step):
+    """A mission that counts up by ``step``; its record is the count, its verdict whether it wants to stop."""
+    state = state + step
+    return state, {"count": state}, state >= inputs["scale"]
+
+
+def _until_any_wants_to_stop(verdicts, common):
+    return ~jnp.any(verdicts), (common[0] + 1.0,)
+
+
+@pytest.mark.parametrize("most", [1, 3, 8])
+@pytest.mark.parametrize("count", [1, 3, 4])
+def test_a_function_is_evaluated_again_until_a_mission_wants_the_host(count, most):
+    """Steps of 1, 2, 3, …: the counts are 1, 3, 6, 10, 15; 10 is the first mission's limit."""
+    missions = Batch(count, Clock())
+    inputs = missions.spread([of_mission(10.0 + 90.0 * (k > 0)) for k in range(count)])
+    state, again = missions.put(np.zeros(count, np.float32)), batch.Again(most, _until_any_wants_to_stop)
+    state, records, stop, times = missions.run(
+        "counted", _counted, [inputs], state, (np.float32(1.0),), donate=True, again=again
+    )
+    made = min(most, 4) if count < 4 else 1  # on two devices one evaluation a call
+    np.testing.assert_array_equal(times, np.full(count, made))
+    rows = np.zeros(most if count < 4 else 1)
+    rows[:made] = [1.0, 3.0, 6.0, 10.0][:made]
+    np.testing.assert_array_equal(records["count"], np.tile(rows, (count, 1)))
+    np.testing.assert_array_equal(state, np.full(count, rows[made - 1]))
+    np.testing.assert_array_equal(stop, [made == 4] + [False] * (count - 1))
