@@ -48,7 +48,7 @@ def measure_fleet(
     result = jax.block_until_ready(run(*flight))
     seconds = min(_timed(run, flight) for _ in range(repeats))
     few = min(vehicles, 256)
-    check = jax.jit(partial(_fly, engine, "vmap", own_parameters, ticks))(*_flight(params, few, own_parameters))
+    check = _flown(engine, "vmap", own_parameters, ticks, *_flight(params, few, own_parameters))
     apart = float(jnp.max(jnp.abs(result[:few] - check)))
     speed = vehicles * ticks * SUBSTEPS / seconds
     return FleetSpeed(vehicles, engine, layout, own_parameters, speed, compile_s, apart)
@@ -99,3 +99,6 @@ def _fly(
     every = over_vehicles(one, in_axes=(axis, 0, None, None), layout=layout)
     positions: jax.Array = every(params, target_m, wind, ground)
     return positions
+
+
+_flown = jax.jit(_fly, static_argnums=(0, 1, 2, 3))  # compiled once for the layouts that are compared with it
