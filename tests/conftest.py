@@ -32,8 +32,12 @@ settings.load_profile("deterministic")
 
 
 @pytest.fixture(autouse=True, scope="module")
-def forget_programs() -> Iterator[None]:
-    """Free each file's compiled programs: some hundred of them would use up a process's memory maps."""
+def programs_of_a_file(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Compile quickly, but for files that compute for long (marked ``optimised``); free the programs afterwards.
+
+    Some hundred of them would use up a process's memory maps.
+    """
+    jax.config.update("jax_disable_most_optimizations", request.node.get_closest_marker("optimised") is None)
     yield
     programs.forget()
     jax.clear_caches()

@@ -13,6 +13,8 @@ from swarmsim.config.files import packaged_dir
 from swarmsim.config.load import load_named
 from swarmsim.config.scenario import load_scenario
 
+pytestmark = pytest.mark.optimised
+
 README = Path(__file__).parents[1] / "README.md"
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", README.read_text(encoding="utf-8"), re.S)
 PYTHON = [text for language, text in BLOCKS if language == "python"]

@@ -1,9 +1,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from swarmsim.estimation import RadiationMap, extract_hotspots, initial_points, interpolate
 from tests.estimation.survey import detector, draw, mapping, mean_rates, place, survey
+
+pytestmark = pytest.mark.optimised
 
 PARAMS = mapping(half=35.0, variance_kept=0.85, cell_m=2.5)
 ALARM = mapping(half=25.0, variance_kept=0.85, cell_m=2.5)

@@ -30,6 +30,8 @@ from tests.estimation.survey import (
     survey,
 )
 
+pytestmark = pytest.mark.optimised
+
 SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
 QUICK = settings(iterations=120, search_rounds=2, fisher_steps=4, rays_per_window=1, sample_rounds=4, samples=32)
 MAP = mapping(variance_kept=0.9, cell_m=5.0, length_scale_m=14.0)

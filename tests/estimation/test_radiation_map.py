@@ -12,6 +12,8 @@ from swarmsim.estimation import extract_hotspots, interpolate
 from swarmsim.estimation.radiation_map import _significance, matern, posterior
 from tests.estimation.survey import draw, mapping, survey, windows
 
+pytestmark = pytest.mark.optimised
+
 SMALL = mapping(half=12.0, variance_kept=0.9995)
 COARSE = mapping(half=35.0, variance_kept=0.9, cell_m=2.5)
 COARSE_SURVEY = survey(half=35.0, lines=8, count=240)

@@ -12,6 +12,8 @@ from swarmsim.estimation import extract_hotspots, interpolate
 from swarmsim.estimation.recursive_map import default_bin_cells, measurements, read, start, update
 from tests.estimation.survey import draw, mapping, survey, windows
 
+pytestmark = pytest.mark.optimised
+
 HALF = 24.0
 MAP = mapping(half=HALF, cell_m=1.5)  # bins of one cell, a quarter of the length scale of 6 m
 SURVEY = survey(half=HALF, lines=7, count=200)

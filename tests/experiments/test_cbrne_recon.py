@@ -7,6 +7,8 @@ import pytest
 
 import swarmsim
 
+pytestmark = pytest.mark.optimised
+
 SCRIPT = Path(__file__).parents[2] / "experiments" / "cbrne_recon" / "run.py"
 
 

@@ -16,6 +16,8 @@ from swarmsim.radiation import draw_counts, observed_rate
 from swarmsim.randomness import mission_keys
 from swarmsim.sensors.radiation import source_rate
 
+pytestmark = pytest.mark.optimised
+
 SEEDS = 256
 # Fewer rounds, rays and places than a mission takes: the bound is asked for within 30 %, and there are 256 fits.
 QUICK = (

@@ -9,6 +9,8 @@ import pytest
 
 import swarmsim
 
+pytestmark = pytest.mark.optimised
+
 FIELD = """
 name: {name}
 site: meadows

@@ -11,6 +11,8 @@ import swarmsim
 from swarmsim.results.names import MEASUREMENTS, MISSIONS, TRAJECTORIES
 from swarmsim.runtime.simulation import Simulation
 
+pytestmark = pytest.mark.optimised
+
 RECON = ("engine=analytic",)  # in batches of two, as in the README's example, so that they share their programs
 
 

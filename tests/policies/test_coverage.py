@@ -12,6 +12,8 @@ from swarmsim.policies.coverage import ParallelLinesPlanner, SurveyTask, bands_n
 from tests.policies.assignments import assignment, situation
 from tests.policies.sites import block_site
 
+pytestmark = pytest.mark.optimised
+
 planner = ParallelLinesPlanner()
 fly = jax.jit(planner.plan)
 HOMES = ((-38.0, -20.0), (-38.0, 0.0), (-38.0, 20.0))

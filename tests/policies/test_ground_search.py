@@ -10,6 +10,8 @@ from swarmsim.policies.routes import coarsen, cost_to_go, descend, smooth
 from tests.policies.assignments import assignment, situation
 from tests.policies.sites import block_site
 
+pytestmark = pytest.mark.optimised
+
 planner = ApproachAndOrbit()
 plan = jax.jit(planner.plan)
 TARGET = (10.0, 4.0)

@@ -19,6 +19,8 @@ from tests.world.point_masses import (
     traffic,
 )
 
+pytestmark = pytest.mark.optimised
+
 # --- the rules --------------------------------------------------------------------------------------------------------
 
 
