@@ -9,7 +9,6 @@ import pytest
 
 import swarmsim
 
-pytestmark = pytest.mark.optimised
 
 FIELD = """
 name: {name}
