@@ -9,7 +9,6 @@ import pytest
 
 import swarmsim
 
-
 FIELD = """
 name: {name}
 site: meadows
