@@ -73,6 +73,22 @@ def test_a_users_policy_from_a_file_flies(climbing):
     np.testing.assert_allclose(asked, np.ceil(ticks / 10), atol=6)  # each 0.1 s; the last segment runs to its end
 
 
+def test_decision_periods_in_one_call_are_those_of_a_call_each(climbing, monkeypatch):
+    together = climbing.rollout([0, 3, 5])
+    monkeypatch.setattr("swarmsim.runtime.simulation.AT_ONCE", 1)
+    one_by_one = climbing.rollout([0, 3, 5])
+    assert len(together.segments) < len(one_by_one.segments) == sum(s.periods for s in one_by_one.segments)
+    assert sum(s.periods for s in together.segments) == len(one_by_one.segments)
+    np.testing.assert_array_equal(together.end.over_s, one_by_one.end.over_s)
+    for index in range(3):
+        records = [swarmsim.mission_record(climbing, batch, index) for batch in (together, one_by_one)]
+        for vehicle, other in zip(*(record.vehicles for record in records), strict=True):
+            np.testing.assert_array_equal(vehicle.time_s, other.time_s)
+            np.testing.assert_allclose(vehicle.position_m, other.position_m, atol=1e-4)
+        np.testing.assert_array_equal(*(record.samples.time_s for record in records))
+        np.testing.assert_array_equal(*(record.samples.counts for record in records))
+
+
 def test_a_policy_is_asked_at_its_period_and_told_of_each_reading_once(tmp_path):
     """Every tick; every third of them, which falls between judgements; and every second judgement."""
     (tmp_path / "my.py").write_text(LISTEN, encoding="utf-8")
