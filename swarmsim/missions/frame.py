@@ -35,9 +35,10 @@ from swarmsim.missions.state import MissionState, PhaseState
 from swarmsim.policies.view import Belief, Task, View
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
-from swarmsim.sensors.radiation import Reading, count, unread
+from swarmsim.sensors.radiation import Reading
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world import events
+from swarmsim.world.counting import counted, not_seen, noted
 from swarmsim.world.judge import look_around, record_events
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.radio import Heard
@@ -79,18 +80,21 @@ class _Role:
 
 def frame(world: World, plan: Plan, mission: MissionState) -> MissionState:
     """The mission one judging period later."""
-    seen, collided = look_around(world, mission.world)
+    seen, collided = look_around(world, mission.world, mission.world.clock.tick // world.timing.judge_ticks)
     mission = replace(mission, world=seen)
     mission = replace(mission, phases=ask(world, plan, mission))
+    tick, running = mission.world.clock.tick, mission.world.clock.running
     groups, phases = list(mission.world.groups), list(mission.phases)
     for number in range(len(groups)):
         roles = _roles(world, plan, number)
         flown = _fly(world, plan, mission, number, roles, collided[number])
-        groups[number] = _counted(world, mission, number, flown)
+        groups[number] = counted(
+            world, world.groups[number], mission.world.key, tick, world.timing.judge_ticks, running[number],
+            mission.world.groups[number], flown.state, flown.seen,
+        )  # fmt: skip
         for role, part, done_s in zip(roles, flown.parts, flown.done_s, strict=True):
             phases[role.number] = _with_part(phases[role.number], role, part, done_s)
-    clock = mission.world.clock
-    clock = replace(clock, tick=clock.tick + world.timing.judge_ticks)
+    clock = replace(mission.world.clock, tick=tick + world.timing.judge_ticks)
     return replace(mission, phases=tuple(phases), world=replace(mission.world, groups=tuple(groups), clock=clock))
 
 
@@ -159,7 +163,7 @@ def _rests(group: Group, ticks: int, params: Any, limits: Limits, state: GroupSt
     """One vehicle of a group that has no part in the mission now."""
     *_, parts = others
     never = tuple(jnp.float32(jnp.inf) for _ in parts)
-    return _Flown(state=state, parts=parts, done_s=never, seen=_not_seen(group, ticks, state))
+    return _Flown(state=state, parts=parts, done_s=never, seen=not_seen(group, ticks, state.vehicle.body))
 
 
 def _one(
@@ -189,10 +193,10 @@ def _one(
             kept.append(part)
         command = chosen(group, params, state.vehicle, commands)
         state = with_move(state, move(world, group.kind, params, state, command))
-        seen = _noted(group, shared.first, at + 1, seen, state.vehicle.body)
+        seen = noted(group, shared.first, at + 1, seen, state.vehicle.body)
         return (step + 1, state, tuple(kept), seen), None
 
-    start = (jnp.int32(0), state, parts, _not_seen(group, timing.judge_ticks, state))
+    start = (jnp.int32(0), state, parts, not_seen(group, timing.judge_ticks, state.vehicle.body))
     (_, state, parts, seen), _ = jax.lax.scan(tick, start, None, length=timing.judge_ticks)
     after = shared.first + timing.judge_ticks
     last, able = view(state, after, reading), events.able(state.event_time_s)
@@ -248,42 +252,6 @@ def _with_part(state: PhaseState, role: _Role, part: _Part, done_s: jax.Array) -
         here = role.phase.places.index(role.place)
         held = (*held[:here], rows(part.held, local), *held[here + 1 :])
     return replace(state, memory=memory, held=held)
-
-
-def _not_seen(group: Group, ticks: int, state: GroupState) -> tuple[RigidState, ...]:
-    """Room for where a vehicle is when its detector's rate is due in so many control periods."""
-    times = 0 if group.counter is None else -(-ticks // group.counter.ticks)
-    return tuple(state.vehicle.body for _ in range(times))
-
-
-def _noted(
-    group: Group, first: jax.Array, tick: jax.Array, seen: tuple[RigidState, ...], body: RigidState
-) -> tuple[RigidState, ...]:
-    """Where the rates were due since control period ``first``, after control period ``tick``."""
-    if group.counter is None:
-        return seen
-    ticks = group.counter.ticks
-    due, place = tick % ticks == 0, tick // ticks - first // ticks - 1
-    return tuple(jax.tree.map(partial(jnp.where, due & (place == k)), body, before) for k, before in enumerate(seen))
-
-
-def _counted(world: World, mission: MissionState, number: int, flown: _Flown) -> GroupState:
-    """The group with its detectors after a judging period."""
-    group, before = world.groups[number], mission.world.groups[number]
-    counter, counter_state, state = group.counter, before.counter, flown.state
-    if counter is None or counter_state is None:
-        return state
-    timing, first = world.timing, mission.world.clock.tick
-    measuring = before.active & events.able(state.event_time_s)
-    counter_state = unread(counter_state)
-    for place, body in enumerate(flown.seen):
-        tick = (first // counter.ticks + 1 + place) * counter.ticks
-        due = mission.world.clock.running[number] & (tick <= first + timing.judge_ticks)
-        counter_state = count(
-            counter, counter_state, body, measuring, group.member, world.site, world.sources, mission.world.key, tick,
-            timing.control_period_s, due,
-        )  # fmt: skip
-    return replace(state, counter=counter_state)
 
 
 __all__ = ["frame"]

@@ -44,7 +44,8 @@ def over_vehicles(
     kind) and `shard_map` work on the result; call it inside a `jit`.
 
     Arrays that all vehicles share (axis None) are traced values if they are, and otherwise constants, which are folded:
-    pass parameters as numpy arrays to have them compiled in. Arrays of more than 64 elements are not taken apart, nor
+    pass parameters as numpy arrays to have them compiled in. So are mapped arrays that are known while tracing and are
+    the same for all vehicles. Arrays of more than 64 elements are not taken apart, nor
     are operations that have no form in scalars (random bits, sorting, linear solvers): these are vmapped one by one.
 
     Args:
@@ -73,6 +74,7 @@ def over_vehicles(
         leaves, tree = jax.tree.flatten((args, kwargs))
         leaf_axes = _leaf_axes(axes, args) + [0] * len(jax.tree.leaves(kwargs))
         size = _vehicles(leaves, leaf_axes)
+        leaves, leaf_axes = _shared(leaves, leaf_axes, args, returned)
         moved = [
             x if axis in (None, 0) else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, leaf_axes, strict=True)
         ]
@@ -97,6 +99,26 @@ def _leaf_axes(axes: tuple[Any, ...], args: tuple[Any, ...]) -> list[int | None]
 
     jax.tree.map(add, axes, args, is_leaf=lambda x: x is None)
     return found
+
+
+def _shared(
+    leaves: list[Any], axes: list[int | None], args: Sequence[Any], returned: Sequence[int]
+) -> tuple[list[Any], list[int | None]]:
+    """Leaves and their axes, where a mapped leaf that is known and the same for all vehicles is of one vehicle.
+
+    XLA takes such a constant for a broadcast, which it computes anew wherever a kernel reads it: for the parameters of
+    a team of one kind this is thirty launches at each control period.
+    """
+    ends = [0, *itertools.accumulate(len(jax.tree.leaves(arg)) for arg in args)]
+    kept = {leaf for number in returned for leaf in range(ends[number], ends[number + 1])}
+    leaves, axes = list(leaves), list(axes)
+    for number, (leaf, axis) in enumerate(zip(leaves, axes, strict=True)):
+        if axis != 0 or number in kept or not is_foldable(leaf, jax.typeof(leaf).update(shape=np.shape(leaf)[1:])):
+            continue
+        every = np.asarray(leaf)
+        if (every == every[:1]).all():
+            leaves[number], axes[number] = every[:1].reshape(every.shape[1:]), None
+    return leaves, axes
 
 
 def _places(args: Sequence[Any], returned: Sequence[int], axes: Sequence[int | None], arrays: int) -> list[int]:

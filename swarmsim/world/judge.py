@@ -1,7 +1,6 @@
 """What judges vehicles, at a rate of its own: the ground below, the wind, the traffic, the radio, and events."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -16,25 +15,14 @@ from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below
 from swarmsim.world.radio import broadcast
 from swarmsim.world.right_of_way import kept_aside, right_of_way
-from swarmsim.world.state import GroupState, Surroundings, WorldState, now_s
+from swarmsim.world.state import GroupState, Surroundings, WorldState
 
 
-def judge(world: World, state: WorldState) -> WorldState:
-    """The state with the surroundings of every vehicle refreshed and its events recorded."""
-    state, collided = look_around(world, state)
-    now = now_s(world, state)
-    groups = []
-    for group, g, hit in zip(world.groups, state.groups, collided, strict=True):
-        one = partial(record_events, world, group.kind, now)
-        seen = replace(g, counter=None)
-        judged = over_vehicles(one, layout=world.layout, unroll=1)(group.params, group.limits, seen, hit)
-        groups.append(replace(judged, counter=g.counter))
-    return replace(state, groups=tuple(groups))
+def look_around(world: World, state: WorldState, number: jax.Array) -> tuple[WorldState, list[jax.Array]]:
+    """The state with ground, wind, traffic and radio refreshed, and which vehicles [U] of each group have collided.
 
-
-def look_around(world: World, state: WorldState) -> tuple[WorldState, list[jax.Array]]:
-    """The state with ground, wind, traffic and radio refreshed, and which vehicles [U] of each group have collided."""
-    number = state.clock.tick // world.timing.judge_ticks
+    ``number`` [] int32 is the judging period's, which gusts and the radio's losses are drawn for.
+    """
     gusts = randomness.consumer(state.key, "gusts")
     around = [
         _refreshed(world, group, gusts, number, running, g)

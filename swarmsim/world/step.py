@@ -3,7 +3,7 @@
 Pure and without a host call, so that `jax.jit`, `jax.vmap`, `jax.lax.scan` and `jax.grad` work on it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,14 +15,15 @@ from swarmsim import randomness
 from swarmsim.physics.wind import gust_start
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
-from swarmsim.sensors.radiation import count, counter_start, unread
+from swarmsim.sensors.radiation import counter_start
 from swarmsim.world import events
-from swarmsim.world.judge import judge
+from swarmsim.world.counting import counted, not_seen, noted
+from swarmsim.world.judge import look_around, record_events
 from swarmsim.world.kinds import KINDS
-from swarmsim.world.model import Group, World
+from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below
 from swarmsim.world.radio import radio_start
-from swarmsim.world.state import Clock, GroupState, Readings, Surroundings, WorldState
+from swarmsim.world.state import Clock, GroupState, Readings, Surroundings, WorldState, now_s
 
 
 def reset(world: World, key: jax.Array, *, active: bool = True) -> WorldState:
@@ -66,24 +67,39 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
     )
 
 
-def step(world: World, state: WorldState, commands: Sequence[Any]) -> tuple[WorldState, Readings]:
-    """The world one control period later, and what its detectors read.
+def step(world: World, state: WorldState, commands: Sequence[Any], periods: int = 1) -> tuple[WorldState, Readings]:
+    """The world one control period later, or a few under the same commands, and what its detectors read.
 
     Args:
         world: of one mission.
         state: at the start of the period.
         commands: one for each group, with leading axis U: a class of `swarmsim.control.commands` that suits its kind.
             Vehicles that are not active disregard it.
+        periods: control periods that the commands are held for, at most those of a judging period. What judges the
+            vehicles comes before the first of them; with one ``periods`` that divides a judging period throughout, the
+            result is that of a call for each period, in a fraction of the time.
 
     Returns:
-        State and readings; ``fresh`` tells which exposures ended in this period.
+        State and readings; ``fresh`` tells which exposures ended in these periods.
 
     Raises:
-        TypeError, ValueError: while tracing, where a command does not suit its group.
+        TypeError, ValueError: while tracing, where a command does not suit its group, or ``periods`` are too many.
     """
-    due = state.clock.tick % world.timing.judge_ticks == 0
-    state = jax.lax.cond(due, partial(judge, world), lambda s: s, state)
-    state = advance(world, state, commands)
+    judging = world.timing.judge_ticks
+    if not 1 <= periods <= judging:
+        raise ValueError(
+            f"periods is {periods}: commands can be held for 1 to {judging} control periods, which are a judging period"
+        )
+    first = state.clock.tick
+    due = -first % judging < periods
+    look = partial(look_around, world, number=(first + periods - 1) // judging)
+    untouched = [jnp.zeros(group.size, bool) for group in world.groups]
+    state, collided = jax.lax.cond(due, look, lambda s: (s, untouched), state)
+    go = partial(_go, world, state, due, periods)
+    full = full_commands(world, commands)
+    groups = tuple(go(number, command, hit) for number, (command, hit) in enumerate(zip(full, collided, strict=True)))
+    clock = replace(state.clock, tick=first + periods)
+    state = replace(state, clock=clock, groups=groups)
     return state, readings_of(state)
 
 
@@ -128,16 +144,6 @@ def _one(params: Any) -> Any:
     return jax.tree.map(lambda x: x[0], params)
 
 
-def advance(world: World, state: WorldState, commands: Sequence[Any]) -> WorldState:
-    """The world one control period later, without looking at ground, traffic, wind and events."""
-    tick = state.clock.tick + 1
-    groups = []
-    for number, (group, command) in enumerate(zip(world.groups, full_commands(world, commands), strict=True)):
-        go = partial(_advance_group, world, group, state.key, tick, command)
-        groups.append(jax.lax.cond(state.clock.running[number], go, lambda g: g, state.groups[number]))
-    return replace(state, clock=replace(state.clock, tick=tick), groups=tuple(groups))
-
-
 @pytree
 class Moved:
     """What a control period changes of a vehicle, its counter apart."""
@@ -171,18 +177,58 @@ def with_move(state: GroupState, moved: Moved) -> GroupState:
     )
 
 
-def _advance_group(
-    world: World, group: Group, key: jax.Array, tick: jax.Array, command: Any, before: GroupState
+def _go(
+    world: World, state: WorldState, due: jax.Array, periods: int, number: int, command: Any, collided: jax.Array
 ) -> GroupState:
+    """A group after control periods under one full command, each vehicle by itself; judged before them if ``due``."""
+    group, before = world.groups[number], state.groups[number]
+    first, running, now = state.clock.tick, state.clock.running[number], now_s(world, state)
+    judged = partial(record_events, world, group.kind, now)
+
+    def moved(params: Any, vehicle: GroupState, command: Any, seen: Any, done: jax.Array) -> Any:
+        vehicle = with_move(vehicle, move(world, group.kind, params, vehicle, command))
+        return vehicle, noted(group, first, first + done + 1, seen, vehicle.vehicle.body)
+
+    over = partial(over_vehicles, layout=world.layout, unroll=1)
+    if _in_kernels():
+        go = over(partial(_all_periods, group, periods, running, due, judged, moved), returned=(2,))
+    else:
+        each = over(judged), over(moved, in_axes=(0, 0, 0, 0, None))
+        go = partial(_all_periods, group, periods, running, due, *each)
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
-    one = partial(move, world, group.kind)
-    every = over_vehicles(one, layout=world.layout, unroll=1)
-    after = with_move(before, every(group.params, seen, command))
-    if group.counter is None or before.counter is None:
-        return after
-    measuring = after.active & events.able(after.event_time_s)
-    counter = count(
-        group.counter, unread(before.counter), after.vehicle.body, measuring, group.member, world.site, world.sources,
-        key, tick, world.timing.control_period_s, tick % group.counter.ticks == 0,
-    )  # fmt: skip
-    return replace(after, counter=counter)
+    after, places = go(group.params, group.limits, seen, collided, command)
+    return counted(world, group, state.key, first, periods, running, before, after, places)
+
+
+def _in_kernels() -> bool:
+    """Whether branches and loops stand inside what is done for each vehicle.
+
+    In a kernel of a GPU they cost nothing; on a CPU, XLA makes less of scalars that pass through them than of arrays.
+    """
+    return jax.default_backend() == "gpu"
+
+
+def _all_periods(
+    group: Group, periods: int, running: jax.Array, due: jax.Array, judged: Callable[..., Any],
+    moved: Callable[..., Any], params: Any, limits: Limits, vehicle: GroupState, collided: jax.Array, command: Any,
+) -> Any:  # fmt: skip
+    """Vehicles after control periods, and where the rates of their detectors were due.
+
+    Of one vehicle or, with ``judged`` and ``moved`` of all, of a group.
+    """
+
+    def goes(vehicle: GroupState) -> Any:
+        vehicle = jax.lax.cond(due, lambda v: judged(params, limits, v, collided), lambda v: v, vehicle)
+
+        def tick(carry: Any, _: None) -> tuple[Any, None]:
+            done, vehicle, seen = carry
+            vehicle, seen = moved(params, vehicle, command, seen, done)
+            return (done + 1, vehicle, seen), None
+
+        start = (jnp.int32(0), *rests(vehicle))
+        return jax.lax.scan(tick, start, None, length=periods)[0][1:]
+
+    def rests(vehicle: GroupState) -> Any:
+        return vehicle, not_seen(group, periods, vehicle.vehicle.body)
+
+    return jax.lax.cond(running, goes, rests, vehicle)

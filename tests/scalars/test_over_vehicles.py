@@ -219,6 +219,17 @@ def test_numpy_arguments():
     assert_alike(over_vehicles(lambda x: x * np.float64(2.0) + 1)(np.asarray(x3)), 2.0 * x3 + 1)
 
 
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_what_is_known_and_alike_is_a_constant(platform):
+    alike, uneven = jnp.full((N, 3), 2.0), jnp.full((N, 3), 2.0).at[1].set(jnp.nan)
+    every = over_vehicles(lambda x, y: x * y, platform=platform)
+    for known in (alike, uneven, np.asarray(alike)):
+        assert_alike(jax.jit(lambda x, known=known: every(x, known))(x3), x3 * known)
+        assert_alike(jax.jit(jax.vmap(lambda x, known=known: every(x, known)))(MISSIONS), MISSIONS * known)
+    shapes = [v.aval.shape for v in jax.make_jaxpr(lambda x: every(x, alike))(x3).jaxpr.constvars]
+    assert (N, 3) not in shapes
+
+
 def test_arguments_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="no layout 'arrays'"):
         over_vehicles(lambda x: x, layout="arrays")  # type: ignore[arg-type]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from swarmsim.control.commands import go_to
+from swarmsim.world import step as stepping
 from swarmsim.world.state import mission_axes
 from swarmsim.world.step import step
 from tests.world.worlds import at_tick, begin, row, world
@@ -87,6 +88,34 @@ def mission(batch, number):
 
 def test_a_scan_equals_the_steps_one_by_one(fields, begun, commands, flown):
     assert_close(jax.jit(scanned)(fields[1], begun[1], commands), flown[1])
+
+
+@pytest.mark.parametrize("in_kernels", [False, True], ids=["between branches", "inside them"])
+def test_commands_held_for_a_judging_period_are_those_of_each_period(
+    fields, begun, commands, flown, in_kernels, monkeypatch
+):
+    monkeypatch.setattr(stepping, "_in_kernels", lambda: in_kernels)
+    held = jax.jit(lambda field, state: step(field, state, commands, 5))
+    state, fresh = begun[0], []
+    for _ in range(TICKS // 5):
+        state, (reading,) = held(fields[0], state)
+        fresh.append(np.asarray(reading.fresh)[0])
+    expected, (each,) = flown[0]
+    assert_close(state, expected)
+    np.testing.assert_array_equal(fresh, np.reshape(np.asarray(each.fresh)[:, 0], (5, 5)).any(axis=1))
+    heights = []  # of a mission whose judging falls within the calls: each call judges once
+    state = begun[1]
+    for _ in range(3):
+        state, _ = held(fields[0], state)
+        heights.append(float(state.groups[0].around.height_m[0]))
+    assert heights[0] < heights[1] < heights[2]
+    assert int(state.clock.tick) == STARTS[1] + 15
+
+
+def test_commands_are_held_for_a_judging_period_at_most(fields, begun, commands):
+    for periods in (0, 6):
+        with pytest.raises(ValueError, match=f"periods is {periods}: .* 1 to 5"):
+            step(fields[0], begun[0], commands, periods)
 
 
 def test_a_batch_of_missions_at_different_ticks_equals_its_missions(fields, begun, commands, flown):
