@@ -77,7 +77,7 @@ def test_aerial_estimate_reaches_the_cramer_rao_bound_and_knows_its_error():
 
 
 def test_ideal_detector_reaches_its_bound_too():
-    site, d, flight = place(), (detector("paper_ideal"),), survey(count=462)
+    site, d, flight = place(), (detector("paper_ideal"),), survey()
     fits = fly(site, d, flight, mean_rates(site, d, flight, [(SOURCE, ACTIVITY)]), 12)
     rmse = np.sqrt(np.mean(np.asarray(fits.position_m - SOURCE) ** 2, axis=0))
     assert np.all(rmse[:2] < 1.3 * cramer_rao_std(site, d, flight)[:2])
