@@ -125,3 +125,7 @@ def settings(height=1.0, height_std=0.5, **changes):
         "learning_rate_m": 0.3,
     }
     return localisation_params(Localisation(**(spec | changes)))
+
+
+SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
+QUICK = settings(iterations=120, search_rounds=2, fisher_steps=4, rays_per_window=1, sample_rounds=4, samples=32)

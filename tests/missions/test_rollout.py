@@ -13,7 +13,7 @@ from swarmsim.runtime.simulation import Simulation
 
 pytestmark = pytest.mark.optimised
 
-RECON = ("engine=analytic",)  # in batches of two, as in the README's example, so that they share their programs
+RECON = ("engine=analytic", "seed=5")
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,8 @@ def simulation() -> Simulation:
 
 @pytest.fixture(scope="module")
 def batch(simulation):
-    return simulation.rollout([5, 6])
+    # two missions with an activity each, as in the README's example, so that they share their programs
+    return simulation.rollout([5, 6], values={"sources.0.activity_mbq": [170.0, 170.0]})
 
 
 @pytest.fixture(scope="module")
@@ -108,17 +109,16 @@ def test_no_activity_is_a_clear_finding(simulation):
     assert np.ptp(rover.position_m[:, :2], axis=0).max() < 0.05
 
 
-def test_a_run_is_written_whole_and_flies_again(tmp_path):
-    scenario = swarmsim.load("recon", (*RECON, "seed=5"))
-    swarmsim.run(scenario, tmp_path / "first", missions=2)
+def test_a_run_is_written_whole_and_flies_again(simulation, records, tmp_path):
+    swarmsim.write_run(simulation, records, tmp_path / "first")
     rows = pq.read_table(tmp_path / "first" / MISSIONS).to_pylist()
     assert [row["seed"] for row in rows] == [5, 6]
     assert all(row["success"] for row in rows)
     for name in (MEASUREMENTS, TRAJECTORIES, "mission.rrd", "radiation_map.npz", "summary.json", "scenario.yaml"):
         assert (tmp_path / "first" / name).stat().st_size > 0
     again = swarmsim.load(tmp_path / "first" / "scenario.yaml")
-    moved, here = (jax.tree.structure(swarmsim.build(each).plan) for each in (again, scenario))
-    assert moved == here  # a copy of the mission flies by the same programs
+    # a copy of the mission flies by the same programs
+    assert jax.tree.structure(swarmsim.build(again).plan) == jax.tree.structure(simulation.plan)
     (record,) = swarmsim.run(again, tmp_path / "second")
     summary = json.loads((tmp_path / "second" / "summary.json").read_text(encoding="utf-8"))
     assert summary["source"]["position_m"] == pytest.approx(list(record.estimate.position_m), abs=1e-3)
