@@ -1,6 +1,8 @@
 """Where a run may be written."""
 
-import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from swarmsim.config.errors import InputError
@@ -13,12 +15,18 @@ def check_out(out: Path, force: bool) -> None:
     It can where there is nothing yet or an empty folder and, with ``force``, in place of an earlier run. A folder that
     holds anything else is never replaced.
     """
-    try:
+    with told_of(out):
         _check(out, force)
+
+
+@contextmanager
+def told_of(out: Path) -> Iterator[None]:
+    """Turn errors of the file system, such as a full disk, into an `InputError` about ``out``."""
+    try:
+        yield
     except OSError as error:
-        raise InputError.of(
-            f"the results cannot be written there ({error.strerror})", path="--out", given=str(out)
-        ) from error
+        what = error.strerror or str(error)
+        raise InputError.of(f"the results cannot be written there ({what})", path="--out", given=str(out)) from error
 
 
 def _check(out: Path, force: bool) -> None:
@@ -38,5 +46,7 @@ def _check(out: Path, force: bool) -> None:
             hint = "choose another folder with --out, or replace them with --force"
             raise InputError.of("there are results already", path="--out", given=str(out), suggestion=hint)
     parent = next(p for p in out.absolute().parents if p.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
+    if not parent.is_dir():
         raise InputError.of("the results cannot be written there", path="--out", given=str(out))
+    with tempfile.TemporaryDirectory(prefix=".", dir=parent):
+        pass  # permissions do not tell everything: a folder may lie in a file system that takes no files

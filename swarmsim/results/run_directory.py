@@ -18,7 +18,7 @@ from swarmsim.config.scenario import Scenario
 from swarmsim.playback import figures
 from swarmsim.playback.recording import write_recording
 from swarmsim.results import names
-from swarmsim.results.out_folder import check_out
+from swarmsim.results.out_folder import check_out, told_of
 from swarmsim.results.record import MissionRecord, RadiationMap
 from swarmsim.results.summary import Timings, all_keys, batch_row, batch_summary, summary
 from swarmsim.site.model import SiteModel
@@ -59,7 +59,7 @@ def write_run(
             still stands.
     """
     timings = Timings() if timings is None else timings
-    with atomic_folder(Path(out), partial(check_out, force=force)) as folder:
+    with told_of(Path(out)), atomic_folder(Path(out), partial(check_out, force=force)) as folder:
         started = time.perf_counter()
         (folder / names.SCENARIO).write_text(simulation.scenario.to_yaml(), encoding="utf-8")
         first = records[0]

@@ -170,7 +170,14 @@ def test_columns_of_a_phase_that_only_some_missions_came_to(record: MissionRecor
         assert table["search_duration_s"].to_pylist() == [row.get("search_duration_s") for row in rows]
 
 
-@pytest.mark.parametrize("fault", [KeyboardInterrupt, OSError(28, "No space left on device"), MemoryError])
+@pytest.mark.parametrize(
+    ("fault", "told", "text"),
+    [
+        (KeyboardInterrupt, KeyboardInterrupt, None),
+        (OSError(28, "No space left on device"), InputError, "cannot be written there .No space left on device"),
+        (MemoryError, MemoryError, None),
+    ],
+)
 @pytest.mark.parametrize(
     "where", ["measurements_table", "trajectories_table", "_write_map", "write_recording", "summary"]
 )
@@ -179,6 +186,8 @@ def test_columns_of_a_phase_that_only_some_missions_came_to(record: MissionRecor
 def test_a_fault_leaves_the_place_as_it_was(
     where: str,
     fault: BaseException,
+    told: type[BaseException],
+    text: str | None,
     earlier: bool,
     record: MissionRecord,
     site: SiteModel,
@@ -193,7 +202,7 @@ def test_a_fault_leaves_the_place_as_it_was(
         raise fault
 
     monkeypatch.setattr(run_directory, where, fail)
-    with pytest.raises(fault if isinstance(fault, type) else type(fault)):
+    with pytest.raises(told, match=text):
         write_run(built(site), [record], out, TIMINGS, force=True)
     assert [path.name for path in tmp_path.iterdir()] == (["recon"] if earlier else [])
     if earlier:
@@ -271,6 +280,13 @@ def test_a_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
         check_out(tmp_path / "link", force=True)
     with pytest.raises(InputError, match="cannot be written"):
         check_out(tmp_path / "thesis.tex" / "run", force=False)
+
+
+def test_a_place_where_no_file_can_be_made_is_told_before_the_flight() -> None:
+    if not Path("/proc/self").exists():
+        pytest.skip("no file system here that takes no files")
+    with pytest.raises(InputError, match="cannot be written there"):
+        check_out(Path("/proc/run"), force=False)
 
 
 @pytest.mark.usefixtures("quick")
