@@ -115,8 +115,9 @@ def _shared(
     for number, (leaf, axis) in enumerate(zip(leaves, axes, strict=True)):
         if axis != 0 or number in kept or not is_foldable(leaf, jax.typeof(leaf).update(shape=np.shape(leaf)[1:])):
             continue
-        every = np.asarray(leaf)
-        if (every == every[:1]).all():
+        every = np.ascontiguousarray(leaf)
+        bits = every.view(np.uint8) if every.ndim > 1 and every.size else every[:, None].view(np.uint8)
+        if (bits == bits[:1]).all():  # of the bits: -0.0 is not 0.0, and NaN is NaN
             leaves[number], axes[number] = every[:1].reshape(every.shape[1:]), None
     return leaves, axes
 

@@ -226,6 +226,10 @@ def test_what_is_known_and_alike_is_a_constant(platform):
     for known in (alike, uneven, np.asarray(alike)):
         assert_alike(jax.jit(lambda x, known=known: every(x, known))(x3), x3 * known)
         assert_alike(jax.jit(jax.vmap(lambda x, known=known: every(x, known)))(MISSIONS), MISSIONS * known)
+    signed = np.zeros(N, np.float32)
+    signed[1] = -0.0  # is equal to the others, and not the same
+    inverse = over_vehicles(lambda x, y: x + 1.0 / y, platform=platform)
+    assert_alike(jax.jit(lambda x: inverse(x, signed))(jnp.zeros(N)), 1.0 / jnp.asarray(signed))
     shapes = [v.aval.shape for v in jax.make_jaxpr(lambda x: every(x, alike))(x3).jaxpr.constvars]
     assert (N, 3) not in shapes
 
