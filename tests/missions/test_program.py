@@ -231,6 +231,25 @@ class Move:
 '''
 
 
+def test_an_area_of_the_users_is_covered_and_nothing_else(tmp_path):
+    west, south, east, north = -180.0, 30.0, -140.0, 60.0
+    area = f"[[{west}, {south}], [{east}, {south}], [{east}, {north}], [{west}, {north}]]"
+    settings = f"{{altitude_m: 12, speed_m_s: 6, line_spacing_m: 6, area_m: {area}}}"
+    phases = f"- {{name: cover, who: uav, policy: parallel_lines, settings: {settings}, time_limit_s: 120}}"
+    simulation = swarmsim.build(swarmsim.load(written(tmp_path, "area", UAVS, phases)))
+    record = swarmsim.mission_record(simulation, simulation.rollout(3), 0)
+    assert record.phases[0].in_time
+    assert not any(vehicle.crashed for vehicle in record.vehicles)
+    flown = [vehicle.position_m for vehicle in record.vehicles]
+    places = np.concatenate([place[place[:, 2] > place[:, 2].max() - 3.0] for place in flown])
+    homes = np.array([place[0, :2] for place in flown])
+    low, high = np.minimum(homes.min(axis=0), [west, south]), np.maximum(homes.max(axis=0), [east, north])
+    assert np.all((places[:, :2] > low - 4.0) & (places[:, :2] < high + 4.0))
+    across = np.stack(np.meshgrid(np.arange(west + 2, east, 4.0), np.arange(south + 2, north, 4.0)), axis=-1)
+    gaps = np.linalg.norm(across[..., None, :] - places[:, :2], axis=-1).min(axis=-1)
+    assert gaps.max() < 4.0  # half the spacing, and half a metre of wind
+
+
 def test_a_vehicle_without_a_detector_flies(tmp_path):
     bare = (
         "  - {name: a, type: bare, position_m: [-190, 40]}\n  - {name: b, type: tarot_t650, position_m: [-180, 40]}\n"
