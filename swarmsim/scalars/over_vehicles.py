@@ -113,9 +113,12 @@ def _shared(
     kept = {leaf for number in returned for leaf in range(ends[number], ends[number + 1])}
     leaves, axes = list(leaves), list(axes)
     for number, (leaf, axis) in enumerate(zip(leaves, axes, strict=True)):
-        if axis != 0 or number in kept or not is_foldable(leaf, jax.typeof(leaf).update(shape=np.shape(leaf)[1:])):
+        if axis != 0 or number in kept:
             continue
-        every = np.ascontiguousarray(leaf)
+        kind = jax.typeof(leaf)
+        if not is_foldable(leaf, kind.update(shape=kind.shape[1:])):
+            continue
+        every = np.ascontiguousarray(leaf, kind.dtype)
         bits = every.view(np.uint8) if every.ndim > 1 and every.size else every[:, None].view(np.uint8)
         if (bits == bits[:1]).all():  # of the bits: -0.0 is not 0.0, and NaN is NaN
             leaves[number], axes[number] = every[:1].reshape(every.shape[1:]), None
