@@ -74,17 +74,19 @@ def over_vehicles(
         leaves, tree = jax.tree.flatten((args, kwargs))
         leaf_axes = _leaf_axes(axes, args) + [0] * len(jax.tree.leaves(kwargs))
         size = _vehicles(leaves, leaf_axes)
-        leaves, leaf_axes = _shared(leaves, leaf_axes, args, returned)
         moved = [
             x if axis in (None, 0) else jnp.moveaxis(x, axis, 0) for x, axis in zip(leaves, leaf_axes, strict=True)
         ]
         varied = [axis is not None for axis in leaf_axes]
-        program, arrays, structure = _program(function, tree, moved, varied, unroll)
-        of_vehicle = [False] * (len(arrays) - sum(varied)) + [True] * sum(varied)
+        alike = _alike(moved, leaf_axes, args, returned)
+        program, arrays, structure = _program(function, tree, moved, varied, alike, unroll)
+        own = sum(varied) - len(alike)
+        of_vehicle = [False] * (len(arrays) - own) + [True] * own
         arranged = _ARRANGED.get(platform or jax.default_backend())
         evaluate = partial(program.evaluate, size, of_vehicle)
         if arranged:
-            evaluate = arranged(program, size, of_vehicle, _places(args, returned, leaf_axes, len(arrays)))
+            axes_left = [None if number in alike else axis for number, axis in enumerate(leaf_axes)]
+            evaluate = arranged(program, size, of_vehicle, _places(args, returned, axes_left, len(arrays)))
         return jax.tree.unflatten(structure, evaluate(*arrays))
 
     return mapped
@@ -101,28 +103,26 @@ def _leaf_axes(axes: tuple[Any, ...], args: tuple[Any, ...]) -> list[int | None]
     return found
 
 
-def _shared(
-    leaves: list[Any], axes: list[int | None], args: Sequence[Any], returned: Sequence[int]
-) -> tuple[list[Any], list[int | None]]:
-    """Leaves and their axes, where a mapped leaf that is known and the same for all vehicles is of one vehicle.
+def _alike(leaves: list[Any], axes: list[int | None], args: Sequence[Any], returned: Sequence[int]) -> dict[int, Any]:
+    """For the mapped leaves (by number) that are known and the same for all vehicles, the value of one vehicle.
 
     XLA takes such a constant for a broadcast, which it computes anew wherever a kernel reads it: for the parameters of
     a team of one kind this is thirty launches at each control period.
     """
     ends = [0, *itertools.accumulate(len(jax.tree.leaves(arg)) for arg in args)]
     kept = {leaf for number in returned for leaf in range(ends[number], ends[number + 1])}
-    leaves, axes = list(leaves), list(axes)
+    found = {}
     for number, (leaf, axis) in enumerate(zip(leaves, axes, strict=True)):
-        if axis != 0 or number in kept:
+        if axis is None or number in kept or not len(leaf):
             continue
         kind = jax.typeof(leaf)
-        if not is_foldable(leaf, kind.update(shape=kind.shape[1:])):
+        if not is_foldable(leaf, jax.ShapeDtypeStruct(kind.shape[1:], kind.dtype)):
             continue
         every = np.ascontiguousarray(leaf, kind.dtype)
         bits = every.view(np.uint8) if every.ndim > 1 and every.size else every[:, None].view(np.uint8)
         if (bits == bits[:1]).all():  # of the bits: -0.0 is not 0.0, and NaN is NaN
-            leaves[number], axes[number] = every[:1].reshape(every.shape[1:]), None
-    return leaves, axes
+            found[number] = every[:1].reshape(every.shape[1:]).copy()
+    return found
 
 
 def _places(args: Sequence[Any], returned: Sequence[int], axes: Sequence[int | None], arrays: int) -> list[int]:
@@ -146,8 +146,13 @@ def _vehicles(leaves: list[Any], axes: list[int | None]) -> int:
     return sizes.pop()
 
 
-def _program(function: Callable[..., Any], tree: Any, leaves: list[Any], varied: list[bool], unroll: int) -> Any:
-    """The function of one vehicle as a `Program` with its arguments, and the structure of its results."""
+def _program(
+    function: Callable[..., Any], tree: Any, leaves: list[Any], varied: list[bool], alike: dict[int, Any], unroll: int
+) -> Any:
+    """The function of one vehicle as a `Program` with its arguments, and the structure of its results.
+
+    Leaves that are ``alike`` are traced like the others that are ``varied``, and are constants of the program.
+    """
     inputs = [x for x, of_vehicle in zip(leaves, varied, strict=True) if of_vehicle]
     types = [jax.typeof(x) for x in inputs]
     one = [jax.ShapeDtypeStruct(t.shape[1:], t.dtype, weak_type=t.weak_type) for t in types]
@@ -159,12 +164,19 @@ def _program(function: Callable[..., Any], tree: Any, leaves: list[Any], varied:
         return function(*args, **kwargs)
 
     closed, shape = jax.make_jaxpr(of_one, return_shape=True)(*one)
-    constants, variables, shared = {}, [], []
+    constants, variables, arrays = {}, [], []
     for variable, value in zip(closed.jaxpr.constvars, closed.consts, strict=True):
         if is_foldable(value, variable.aval):
             constants[variable] = np.asarray(value, variable.aval.dtype)
         else:
             variables.append(variable)
-            shared.append(value)
-    program = Program(closed.jaxpr, constants, (*variables, *closed.jaxpr.invars), unroll)
-    return program, [*shared, *inputs], jax.tree.structure(shape)
+            arrays.append(value)
+    numbers = [number for number, of_vehicle in enumerate(varied) if of_vehicle]
+    for number, variable, value in zip(numbers, closed.jaxpr.invars, inputs, strict=True):
+        if number in alike:
+            constants[variable] = alike[number]
+        else:
+            variables.append(variable)
+            arrays.append(value)
+    program = Program(closed.jaxpr, constants, tuple(variables), unroll)
+    return program, arrays, jax.tree.structure(shape)

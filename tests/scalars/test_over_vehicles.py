@@ -234,6 +234,39 @@ def test_what_is_known_and_alike_is_a_constant(platform):
     assert (N, 3) not in shapes
 
 
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_what_is_known_and_alike_is_traced_as_jax_does(platform):
+    def assert_as_vmap(function, *known, x=x3):
+        mapped = over_vehicles(function, platform=platform)
+        found, expected = (jax.jit(lambda x, of=of: of(*known, x))(x) for of in (mapped, jax.vmap(function)))
+        assert found.dtype == expected.dtype
+        np.testing.assert_array_equal(np.asarray(found, np.float32), np.asarray(expected, np.float32))
+
+    def added(p, x):
+        p += 1.0
+        return p * x
+
+    row, number = np.ones((N, 3), np.float32), jnp.arange(N) % 3
+    assert_as_vmap(added, row)
+    np.testing.assert_array_equal(row, 1.0)  # the caller's array is the caller's
+    assert_as_vmap(lambda p, x: p.at[0].set(x[1]), row)
+    assert_as_vmap(lambda p, i: p[i], row, x=number)
+    assert_as_vmap(lambda p, x: p[5] + x, row)
+    assert_as_vmap(lambda a, x: a * x, jnp.full(N, 2.0), x=number.astype(jnp.float16))
+    assert_as_vmap(lambda n, x: n * x, np.full(N, 16777217), x=jnp.full(N, 0.1))
+    assert_as_vmap(lambda a, x: 1.0 / a + x[0], jnp.zeros(N))
+
+
+def test_known_arguments_may_be_none_or_laid_out_on_a_mesh():
+    times = over_vehicles(lambda a, x: a * x)
+    assert jax.jit(lambda x: times(jnp.zeros(0), x))(jnp.zeros(0)).shape == (0,)
+    mesh = jax.make_mesh((1,), ("vehicles",), axis_types=(jax.sharding.AxisType.Explicit,))
+    with jax.set_mesh(mesh):
+        place = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("vehicles"))
+        known, x = (jax.device_put(v, place) for v in (np.arange(4, dtype=np.float32), np.full(4, 2.0, np.float32)))
+        assert_alike(jax.jit(lambda x: times(known, x))(x), jnp.arange(4.0) * 2.0)
+
+
 def test_arguments_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="no layout 'arrays'"):
         over_vehicles(lambda x: x, layout="arrays")  # type: ignore[arg-type]
