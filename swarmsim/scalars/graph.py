@@ -69,8 +69,11 @@ class Graph:
 
     def apply(self, operation: Operation, *operands: Scalar) -> Scalar:
         """Result of an operation on scalars: a constant, one of the operands or a node."""
-        if operation.fold is not None and all(isinstance(x, np.generic) for x in operands):
-            return operation.fold(*operands)
+        if all(isinstance(x, np.generic) for x in operands):
+            if operation.fold is not None:
+                return operation.fold(*operands)
+            with jax.ensure_compile_time_eval():  # a kernel of a GPU takes no constant where it expects a scalar
+                return np.asarray(self._binder(operation)(*operands))[()]
         simple = _SIMPLIFY.get(operation.name)
         if simple is not None and (known := simple(self, *operands)) is not None:
             return known

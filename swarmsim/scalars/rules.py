@@ -87,7 +87,9 @@ def elementwise(graph: Graph, equation: Any, *operands: np.ndarray) -> np.ndarra
     """An elementwise primitive, scalar by scalar."""
     out = equation.outvars[0].aval
     operation = operation_of(equation)
-    if operation.fold is not None and all(x.dtype != object for x in operands):
+    if all(x.dtype != object for x in operands):
+        if operation.fold is None:
+            raise NotWritableError  # evaluated as it is
         return np.asarray(operation.fold(*operands), out.dtype)
     columns = [unpack(x if x.shape == out.shape else np.broadcast_to(x, out.shape)) for x in operands]
     return pack([graph.apply(operation, *row) for row in zip(*columns, strict=True)], out.shape, out.dtype)
