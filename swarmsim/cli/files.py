@@ -17,7 +17,7 @@ from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS
 from swarmsim.config.documents import read_file, shown_path
-from swarmsim.config.errors import InputError, Problem, raise_if_any
+from swarmsim.config.errors import InputError, Problem, file_errors_told, raise_if_any
 from swarmsim.config.load import load_all, load_named
 from swarmsim.config.names import one_of
 
@@ -140,7 +140,8 @@ def _describe(kind: str, model: Any) -> str:
 def copy_configurations(folder: Path) -> None:
     """Copy the packaged configurations to ``folder/configs``, completely or not at all."""
     target = folder / "configs"
-    with atomic_folder(target, _check_new) as copy:
+    told = file_errors_told("the configurations cannot be copied there", file=str(target))
+    with told, atomic_folder(target, _check_new) as copy:
         # Scripts that generate shipped data are not configuration. The temporary folder may lie within the source.
         leave_out = shutil.ignore_patterns("*.py", "__pycache__", ".*")
         shutil.copytree(files.packaged_dir(), copy, ignore=leave_out, dirs_exist_ok=True)

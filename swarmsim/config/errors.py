@@ -1,6 +1,7 @@
 """Input errors: everything that is wrong with what a user gave, gathered and said at once."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,15 @@ class InputError(Exception):
         if isinstance(where.get("file"), Path):
             where["file"] = str(where["file"])
         return cls([Problem(message=sentence, **where)])
+
+
+@contextmanager
+def file_errors_told(sentence: str, **where: Any) -> Iterator[None]:
+    """Turn an error of the file system, such as a full disk, into an `InputError`; ``where`` as in `InputError.of`."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError.of(f"{sentence} ({error.strerror or error})", **where) from error
 
 
 def raise_if_any(problems: Sequence[Problem]) -> None:

@@ -1,11 +1,10 @@
 """Where a run may be written."""
 
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from swarmsim.config.errors import InputError
+from swarmsim.config.errors import InputError, file_errors_told
 from swarmsim.results.names import SCENARIO, SUMMARY
 
 
@@ -19,14 +18,9 @@ def check_out(out: Path, force: bool) -> None:
         _check(out, force)
 
 
-@contextmanager
-def told_of(out: Path) -> Iterator[None]:
+def told_of(out: Path) -> AbstractContextManager[None]:
     """Turn errors of the file system, such as a full disk, into an `InputError` about ``out``."""
-    try:
-        yield
-    except OSError as error:
-        what = error.strerror or str(error)
-        raise InputError.of(f"the results cannot be written there ({what})", path="--out", given=str(out)) from error
+    return file_errors_told("the results cannot be written there", path="--out", given=str(out))
 
 
 def _check(out: Path, force: bool) -> None:

@@ -18,7 +18,7 @@ import platformdirs
 
 from swarmsim.atomic_folder import atomic_folder
 from swarmsim.config.documents import dump_yaml
-from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.errors import InputError, Problem, file_errors_told
 from swarmsim.config.files import available, find
 from swarmsim.config.load import load_model, load_named
 from swarmsim.config.names import did_you_mean, one_of
@@ -182,7 +182,8 @@ def import_site(
     source, out = Path(file), Path(out_dir)
     check_file(source, float((options.fields or {}).get("max_file_mb", MAX_FILE_MB)))
     data = _specification(source, out, options)
-    with atomic_folder(out, partial(_check_out, overwrite=options.overwrite)) as folder:
+    told = file_errors_told("the site cannot be written there", file=out)
+    with told, atomic_folder(out, partial(_check_out, overwrite=options.overwrite)) as folder:
         try:
             model = _make(folder, source, data, material_names)
         except InputError as error:

