@@ -108,7 +108,7 @@ class World:
     groups: tuple[Group, ...]
     timing: Timing
     engine: str = static()  # mjx | analytic
-    layout: Layout = static(default="vmap")  # of vehicles in memory, see `swarmsim.scalars`
+    layout: Layout = static(default="vmap")  # of vehicles; "scalars" is faster to step on a GPU, slower to compile
 
     @property
     def vehicles(self) -> int:
