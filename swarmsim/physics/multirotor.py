@@ -17,16 +17,23 @@ import numpy as np
 from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import Multirotor
 from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench
-from swarmsim.physics.rigid_body import free_body_step
+from swarmsim.physics.rigid_body import free_body_step, rates_after, torque_of_euler_step
 from swarmsim.physics.rotations import from_yaw, multiply, rotation_matrix, to_body, to_world
 from swarmsim.pytree import pytree
 from swarmsim.scalars import Layout, over_vehicles
-from swarmsim.vehicles.multirotor import MultirotorParams, battery_power, free_body_mjcf, rotor_speeds, wrench
+from swarmsim.vehicles.multirotor import (
+    MultirotorParams,
+    battery_power,
+    free_body_mjcf,
+    rotor_momentum,
+    rotor_speeds,
+    wrench,
+)
 from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
 
 Engine = Literal["mjx", "analytic"]
 Step = Callable[[MultirotorParams, MultirotorState, jax.Array, jax.Array, Plane], MultirotorState]
-Integrate = Callable[[MultirotorParams, RigidState, jax.Array, jax.Array], RigidState]
+Integrate = Callable[[MultirotorParams, RigidState, jax.Array, jax.Array, jax.Array], RigidState]
 
 
 @pytree
@@ -34,7 +41,8 @@ class Loads:
     """What acts on the body during one step, and what the step makes of the rest of the state."""
 
     force_n: jax.Array  # [3] N, world
-    torque_nm: jax.Array  # [3] N m, body
+    torque_nm: jax.Array  # [3] N m, body; the rotors' gyroscopic torque apart
+    rotor_momentum_nms: jax.Array  # [] N m s, along body z
     rotor_speed_rad_s: jax.Array  # [R] rad/s at the end of the step
     contact_slip_m: jax.Array  # [C, 3] m, body, at the end of the step
     ground_force_n: jax.Array  # [] N along the ground's normal
@@ -70,7 +78,7 @@ def make_multirotor_step(engine: Engine, dt: float, layout: Layout = "scalars") 
     ) -> MultirotorState:
         loads = step_loads(params, state, rotor_command_rad_s, wind_m_s, ground, dt)
         return MultirotorState(
-            body=integrate(params, state.body, loads.force_n, loads.torque_nm),
+            body=integrate(params, state.body, loads.force_n, loads.torque_nm, loads.rotor_momentum_nms),
             rotor_speed_rad_s=loads.rotor_speed_rad_s,
             contact_slip_m=loads.contact_slip_m,
             ground_force_n=loads.ground_force_n,
@@ -113,7 +121,6 @@ def step_loads(
         speed_after_rad_s=speed,
         rotor_height_m=rotor_height,
         air_velocity_m_s=velocity - to_body(attitude, wind_m_s),
-        angular_velocity_rad_s=body.angular_velocity_rad_s,
         dt=dt,
     )
     ground_force, ground_torque, slip = contact_wrench(
@@ -128,6 +135,7 @@ def step_loads(
     return Loads(
         force_n=to_world(attitude, air_force + ground_force),
         torque_nm=air_torque + ground_torque,
+        rotor_momentum_nms=rotor_momentum(params, speed),
         rotor_speed_rad_s=speed,
         contact_slip_m=slip,
         ground_force_n=jnp.sum(ground_force * normal),
@@ -202,13 +210,16 @@ def _as_scalars(integrate: Integrate) -> Integrate:
 
 
 def _analytic_body(dt: float) -> Integrate:
-    def integrate(params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array) -> RigidState:
+    def integrate(
+        params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array, momentum_nms: jax.Array
+    ) -> RigidState:
         return free_body_step(
             body,
             mass_kg=params.mass_kg,
             inertia_kg_m2=params.inertia_kg_m2,
             force_n=force_n,
             torque_nm=torque_nm,
+            rotor_momentum_nms=momentum_nms,
             dt=dt,
         )
 
@@ -230,13 +241,20 @@ def _mjx_body(dt: float) -> Integrate:
 
     model, template = _free_body(dt)  # constants of the compiled step
 
-    def integrate(params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array) -> RigidState:
+    def integrate(
+        params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array, momentum_nms: jax.Array
+    ) -> RigidState:
         swept = replace(
             model,
             body_mass=jnp.stack([jnp.zeros_like(params.mass_kg), params.mass_kg]),
             body_inertia=jnp.stack([jnp.zeros_like(params.inertia_kg_m2), params.inertia_kg_m2]),
         )
-        torque_world = to_world(rotation_matrix(body.quaternion), torque_nm)
+        inertia, rate = params.inertia_kg_m2, body.angular_velocity_rad_s
+        turning, after = rates_after(rate, inertia, torque_nm, momentum_nms, dt)
+        # MuJoCo's Euler step takes the gyroscopic torque of the old rate, which gains energy; under this torque it
+        # turns the body by the mean rate of the step.
+        torque = torque_of_euler_step(rate, inertia, turning, dt)
+        torque_world = to_world(rotation_matrix(body.quaternion), torque)
         load = jnp.concatenate([force_n, torque_world])
         data = template.replace(
             qpos=jnp.concatenate([body.position_m, body.quaternion]),
@@ -248,7 +266,7 @@ def _mjx_body(dt: float) -> Integrate:
             position_m=data.qpos[:3],
             quaternion=data.qpos[3:],
             velocity_m_s=data.qvel[:3],
-            angular_velocity_rad_s=data.qvel[3:],
+            angular_velocity_rad_s=after,
         )
 
     return integrate

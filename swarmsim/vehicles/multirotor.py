@@ -162,7 +162,6 @@ def wrench(
     speed_after_rad_s: jax.Array,
     rotor_height_m: jax.Array,
     air_velocity_m_s: jax.Array,
-    angular_velocity_rad_s: jax.Array,
     dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Force [3] N and torque [3] N m (body) of rotors and air on the vehicle, mean over a step of ``dt`` s.
@@ -171,28 +170,35 @@ def wrench(
     ``rotor_height_m`` [R] the hubs' heights above the ground, ``air_velocity_m_s`` [3] the vehicle's velocity through
     the air (body).
 
-    Thrust k w^2 along body z; its torque c k w^2 and the reaction to the rotor's acceleration act against the spin; the
-    rotors' angular momentum h along body z turns with the body and so gives the gyroscopic torque -omega x h
-    (Mahony, Kumar, Corke, "Multirotor aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Drag is
-    quadratic against the air velocity, as in the MRS multirotor simulator.
+    Thrust k w^2 along body z; its torque c k w^2 and the reaction to the rotor's acceleration act against the spin
+    (Mahony, Kumar, Corke, "Multirotor aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). The rotors'
+    gyroscopic torque is the integrator's part (`rotor_momentum`). Drag is quadratic against the air velocity, as in the
+    MRS multirotor simulator.
     """
     speed = 0.5 * (speed_before_rad_s + speed_after_rad_s)
     free_thrust = params.thrust_coefficient_n_s2 * speed * speed
     thrust = free_thrust * ground_effect(rotor_height_m, params.rotor_radius_m)
     acceleration = (speed_after_rad_s - speed_before_rad_s) / dt
     shaft_torque = params.moment_constant_m * free_thrust + params.rotor_inertia_kg_m2 * acceleration
-    momentum = params.rotor_inertia_kg_m2 * jnp.sum(params.rotor_spin * speed)
     x, y = params.rotor_position_m[:, 0], params.rotor_position_m[:, 1]
     torque = jnp.stack(
         [
-            jnp.sum(y * thrust) - momentum * angular_velocity_rad_s[1],
-            -jnp.sum(x * thrust) + momentum * angular_velocity_rad_s[0],
+            jnp.sum(y * thrust),
+            -jnp.sum(x * thrust),
             -jnp.sum(params.rotor_spin * shaft_torque),
         ]
     )
     airspeed = jnp.sqrt(jnp.sum(air_velocity_m_s**2) + 1e-12)  # the small term keeps the gradient finite at rest
     drag = -params.drag_quadratic_kg_m * airspeed * air_velocity_m_s
     return drag + jnp.sum(thrust) * jnp.array([0.0, 0.0, 1.0], drag.dtype), torque
+
+
+def rotor_momentum(params: MultirotorParams, speed_rad_s: jax.Array) -> jax.Array:
+    """Angular momentum [] N m s of rotors that turn at ``speed_rad_s`` [R], along body z, relative to the body.
+
+    It turns with the body and so gives the gyroscopic torque -omega x h.
+    """
+    return params.rotor_inertia_kg_m2 * jnp.sum(params.rotor_spin * speed_rad_s)
 
 
 def battery_power(

@@ -27,7 +27,7 @@ FAR = jnp.full(4, 1e3)
 STILL = jnp.zeros(3)
 
 
-def loads(params, speed, *, after=None, height=FAR, air=STILL, rate=STILL, dt=0.005):
+def loads(params, speed, *, after=None, height=FAR, air=STILL, dt=0.005):
     speed = jnp.broadcast_to(jnp.asarray(speed, jnp.float32), (4,))
     return wrench(
         params,
@@ -35,7 +35,6 @@ def loads(params, speed, *, after=None, height=FAR, air=STILL, rate=STILL, dt=0.
         speed_after_rad_s=speed if after is None else after,
         rotor_height_m=height,
         air_velocity_m_s=air,
-        angular_velocity_rad_s=rate,
         dt=dt,
     )
 
