@@ -56,7 +56,8 @@ def airborne(params: MultirotorParams, *, height=100.0, speed=0.0, rate=(0.0, 0.
 
 
 def hover_speed(params: MultirotorParams) -> float:
-    return float(np.sqrt(params.mass_kg * GRAVITY / 4 / params.thrust_coefficient_n_s2))
+    rotors = params.rotor_spin.shape[0]
+    return float(np.sqrt(params.mass_kg * GRAVITY / rotors / params.thrust_coefficient_n_s2))
 
 
 @partial(jax.jit, static_argnames=("name", "engine"))

@@ -6,6 +6,8 @@ Transactions on Control Systems Technology 28(2), 2020: the tilt, which carries 
 World ENU, body FLU, SI units; one vehicle. Run it every 10 ms.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 
@@ -21,8 +23,8 @@ LANDED_AFTER_S = 0.4
 """How long the ground must stop a commanded descent before the vehicle counts as landed."""
 LANDED_LOAD = 0.02
 """Load on the landing gear, over the weight, from which it feels the ground."""
-SOFT_M_S2 = 0.2
-"""Acceleration beyond a limit at which the integral grows half as fast."""
+CATCH_UP = 0.2
+"""Share of the commanded speed by which a vehicle that has fallen behind may exceed its largest speed."""
 LANDED_DESCENT_M_S = 0.2
 """Minimum commanded descent rate for landing detection."""
 LANDED_SPEED_M_S = 0.15
@@ -33,14 +35,19 @@ LANDED_SPEED_M_S = 0.15
 class ControlMemory:
     """What the controller carries from call to call."""
 
-    integral_m_s2: jax.Array  # [3] m/s^2, world: acceleration that holds against wind, payload and model error
+    disturbance_m_s2: jax.Array  # [3] m/s^2, world: estimated acceleration by wind, payload and model error
+    velocity_m_s: jax.Array  # [3] m/s, world: predicted from thrust, attitude and disturbance
+    thrust_m_s2: jax.Array  # [] predicted thrust over the nominal mass; 0 with the motors off
     stuck_s: jax.Array  # [] s for which the ground has stopped a commanded descent: landed from LANDED_AFTER_S on
 
 
 def control_start(*, landed: bool = False) -> ControlMemory:
     """Memory of a controller that has not run yet; ``landed`` leaves the motors off until a climb is commanded."""
     return ControlMemory(
-        integral_m_s2=jnp.zeros(3), stuck_s=jnp.asarray(LANDED_AFTER_S if landed else 0.0, jnp.float32)
+        disturbance_m_s2=jnp.zeros(3),
+        velocity_m_s=jnp.zeros(3),
+        thrust_m_s2=jnp.zeros(()),
+        stuck_s=jnp.asarray(LANDED_AFTER_S if landed else 0.0, jnp.float32),
     )
 
 
@@ -60,27 +67,65 @@ def control(
 
     Only ``params.control`` is read: the controller does not know the true mass. As on a real autopilot, a position
     command whose descent the ground stops is a landing: the rotors are disarmed (commands of zero) until a climb is
-    commanded. Commands below the position level are obeyed without that, and leave the integral as it is.
+    commanded. Commands below the position level are obeyed without that.
     """
     autopilot, body = params.control, state.body
     touching = state.ground_force_n > LANDED_LOAD * GRAVITY_M_S2 * autopilot.mass_kg
-    acceleration, after = _acceleration(autopilot, memory, body, touching, command, dt)
-    pull = acceleration + jnp.array([0.0, 0.0, GRAVITY_M_S2], acceleration.dtype)
     attitude = rotation_matrix(body.quaternion)
+    memory = _observed(autopilot, memory, body, attitude, touching, dt)
+    acceleration, stuck = _acceleration(autopilot, memory, body, touching, command, dt)
+    pull = acceleration + jnp.array([0.0, 0.0, GRAVITY_M_S2], acceleration.dtype)
     pull_body = to_body(attitude, pull)
     rate = _body_rate(autopilot, attitude, pull_body, command.yaw_rad)
     thrust = autopilot.mass_kg * jnp.maximum(pull_body[2], 0.0)
     if isinstance(command, PositionCommand):
-        speeds = _rotor_speeds_of(autopilot, body, rate, thrust)
-        return jnp.where(is_landed(after), 0.0, speeds), after
+        speeds = jnp.where(stuck >= LANDED_AFTER_S, 0.0, _rotor_speeds_of(autopilot, body, rate, thrust))
+        return speeds, replace(memory, thrust_m_s2=_thrust_after(autopilot, memory, speeds, dt), stuck_s=stuck)
     at_position = command.level == POSITION
     wanted = jnp.where(command.level == ATTITUDE, _attitude_rate(autopilot, body, command), command.body_rate_rad_s)
     rate = jnp.where(at_position, rate, wanted)
     thrust = jnp.where(at_position, thrust, jnp.maximum(command.thrust_n, 0.0))
     speeds = _rotor_speeds_of(autopilot, body, rate, thrust)
-    speeds = jnp.where(at_position & is_landed(after), 0.0, speeds)
-    memory = jax.tree.map(lambda new, old: jnp.where(at_position, new, old), after, memory)
-    return jnp.where(command.level <= BODY_RATE, speeds, command.rotor_speed_rad_s), memory
+    speeds = jnp.where(at_position & (stuck >= LANDED_AFTER_S), 0.0, speeds)
+    speeds = jnp.where(command.level <= BODY_RATE, speeds, command.rotor_speed_rad_s)
+    stuck = jnp.where(at_position, stuck, memory.stuck_s)
+    return speeds, replace(memory, thrust_m_s2=_thrust_after(autopilot, memory, speeds, dt), stuck_s=stuck)
+
+
+def _thrust_after(autopilot: ControlParams, memory: ControlMemory, speed_rad_s: jax.Array, dt: float) -> jax.Array:
+    """Predicted thrust [] over the nominal mass (m/s^2) after ``dt`` s of the rotor commands [R]."""
+    held = jnp.clip(speed_rad_s, 0.0, autopilot.speed_max_rad_s)
+    wanted = autopilot.thrust_coefficient_n_s2 * jnp.sum(held * held) / autopilot.mass_kg
+    late = jnp.where((memory.thrust_m_s2 > 0.0) & (wanted > 0.0), jnp.exp(-dt / autopilot.rotor_time_constant_s), 0.0)
+    return wanted + late * (memory.thrust_m_s2 - wanted)
+
+
+def _observed(
+    autopilot: ControlParams,
+    memory: ControlMemory,
+    body: RigidState,
+    attitude: jax.Array,
+    touching: jax.Array,
+    dt: float,
+) -> ControlMemory:
+    """The memory with disturbance and velocity of now.
+
+    An observer of the velocity with both poles at the root of ``velocity_integral_1_s2``. Its prediction takes the
+    attitude as it is and the thrust that the motors can give, so that neither a step nor a limit winds it up, as they
+    do an integral of the control error. On the ground and with the motors off it waits.
+    """
+    predicted = memory.velocity_m_s + dt * (memory.thrust_m_s2 * attitude[:, 2] + memory.disturbance_m_s2)
+    predicted = predicted - jnp.array([0.0, 0.0, dt * GRAVITY_M_S2], predicted.dtype)
+    waits = touching | (memory.thrust_m_s2 <= 0.0)
+    error = jnp.where(waits, 0.0, body.velocity_m_s - predicted)
+    gain = autopilot.velocity_integral_1_s2
+    found = memory.disturbance_m_s2 + dt * gain * error
+    bounds = jnp.stack([autopilot.tilt_max_tan * GRAVITY_M_S2, autopilot.acceleration_max_m_s2])
+    return replace(
+        memory,
+        disturbance_m_s2=_limited(found, bounds),
+        velocity_m_s=jnp.where(waits, body.velocity_m_s, predicted + 2.0 * dt * jnp.sqrt(gain) * error),
+    )
 
 
 def _rotor_speeds_of(autopilot: ControlParams, body: RigidState, rate: jax.Array, thrust: jax.Array) -> jax.Array:
@@ -131,33 +176,35 @@ def _acceleration(
     touching: jax.Array,
     setpoint: MultirotorCommand | PositionCommand,
     dt: float,
-) -> tuple[jax.Array, ControlMemory]:
-    """Wanted acceleration [3] m/s^2 (world) within the limits; the integral stands still where it would wind up."""
+) -> tuple[jax.Array, jax.Array]:
+    """Wanted acceleration [3] m/s^2 (world) within the limits, and how long [] s the ground has stopped a descent."""
     offset = setpoint.position_m - body.position_m
-    approach = autopilot.position_gain_1_s * setpoint.hold_position * offset
+    approach = setpoint.hold_position * _approach(autopilot, offset)
+    fed = setpoint.velocity_m_s
     limits = jnp.stack([autopilot.speed_max_m_s, autopilot.climb_rate_max_m_s])
-    velocity = _limited(setpoint.velocity_m_s + approach, limits)
-    error = velocity - body.velocity_m_s
+    # Without room above the commanded velocity, what a vehicle has once fallen behind it never makes good.
+    pace = jnp.stack([jnp.sqrt(fed[0] * fed[0] + fed[1] * fed[1] + 1e-12), jnp.abs(fed[2])])
+    velocity = _limited(fed + approach, limits + CATCH_UP * jnp.minimum(pace, limits))
     reach = autopilot.acceleration_max_m_s2
-    feedback = setpoint.acceleration_m_s2 + autopilot.velocity_gain_1_s * error
-    wanted = _limited(feedback, jnp.stack([reach, reach])) + memory.integral_m_s2
-    lowest = (LIFT_MIN - 1.0) * GRAVITY_M_S2
-    lift = jnp.maximum(wanted[2], lowest)
+    feedback = setpoint.acceleration_m_s2 + autopilot.velocity_gain_1_s * (velocity - body.velocity_m_s)
+    wanted = _limited(feedback, jnp.stack([reach, reach])) - memory.disturbance_m_s2
+    lift = jnp.maximum(wanted[2], (LIFT_MIN - 1.0) * GRAVITY_M_S2)
     level = _limited(wanted, jnp.stack([autopilot.tilt_max_tan * (GRAVITY_M_S2 + lift), reach]))
-    given = jnp.stack([level[0], level[1], lift])
-    # The integral stands still where it would grow and a limit cuts already: that of the feedback too, or a vehicle far
-    # from its reference turns its integral with it and circles for ever. The passage is smooth, for the derivatives.
-    sign = jnp.sign(error)
-    excess = jnp.maximum((feedback + memory.integral_m_s2 - given) * sign, 0.0) / SOFT_M_S2
-    free = 1.0 / (1.0 + excess * excess)
-    unwinding = jnp.clip(-memory.integral_m_s2 * sign / SOFT_M_S2, 0.0, 1.0)
-    growth = (free + (1.0 - free) * unwinding) * error
-    integral = memory.integral_m_s2 + autopilot.velocity_integral_1_s2 * dt * growth
-    bounds = jnp.stack([autopilot.tilt_max_tan * GRAVITY_M_S2, reach])
     still = touching & (jnp.sum(body.velocity_m_s * body.velocity_m_s) < LANDED_SPEED_M_S**2)
-    return given, ControlMemory(
-        integral_m_s2=_limited(integral, bounds), stuck_s=_stuck(memory.stuck_s, velocity[2], still, dt)
-    )
+    given = jnp.stack([level[0], level[1], lift])
+    return given, _stuck(memory.stuck_s, velocity[2], still, dt)
+
+
+def _approach(autopilot: ControlParams, offset: jax.Array) -> jax.Array:
+    """Velocity [3] m/s towards a place at an ``offset`` [3] m: proportional near it, and farther away what the vehicle
+    can brake from, by half its largest acceleration (the square root controller of ArduPilot's AC_PosControl).
+    """
+    gain, brake = autopilot.position_gain_1_s, 0.5 * autopilot.acceleration_max_m_s2
+    distance = jnp.sqrt(offset[0] * offset[0] + offset[1] * offset[1] + 1e-12)
+    linear = brake / (gain * gain)
+    far = jnp.sqrt(2.0 * brake * jnp.maximum(distance - 0.5 * linear, 0.5 * linear)) / jnp.maximum(distance, linear)
+    level = jnp.where(distance > linear, far, gain)
+    return jnp.stack([level * offset[0], level * offset[1], gain * offset[2]])
 
 
 def _stuck(stuck_s: jax.Array, climb_m_s: jax.Array, still: jax.Array, dt: float) -> jax.Array:

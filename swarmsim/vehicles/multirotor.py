@@ -29,6 +29,7 @@ class ControlParams:
     thrust_coefficient_n_s2: jax.Array  # [] N/(rad/s)^2, nominal
     speed_min_rad_s: jax.Array  # [] rad/s
     speed_max_rad_s: jax.Array  # [] rad/s
+    rotor_time_constant_s: jax.Array  # [] s, nominal: mean of rising and falling
     position_gain_1_s: jax.Array  # []
     velocity_gain_1_s: jax.Array  # []
     velocity_integral_1_s2: jax.Array  # []
@@ -111,6 +112,7 @@ def control_params(spec: Multirotor) -> ControlParams:
         "thrust_coefficient_n_s2": rotor.thrust_coefficient_n_s2,
         "speed_min_rad_s": rotor.speed_min_rad_s,
         "speed_max_rad_s": rotor.speed_max_rad_s,
+        "rotor_time_constant_s": 0.5 * (rotor.time_constant_up_s + rotor.time_constant_down_s),
         "position_gain_1_s": gains.position_gain_1_s,
         "velocity_gain_1_s": gains.velocity_gain_1_s,
         "velocity_integral_1_s2": gains.velocity_integral_1_s2,

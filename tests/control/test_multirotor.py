@@ -74,6 +74,61 @@ def test_tracks_a_survey_line_in_gusts(name, wind, mass):
     assert error.max() < 1.5
 
 
+TYPES = ("tarot_t650", "x500", "dji_f550")
+
+
+@cache
+def response(name, metres, axis):
+    """Position along ``axis`` over the step's ``metres``, every 10 ms after it."""
+    there = 100.0 * np.eye(3)[2] + metres * np.eye(3)[axis]
+
+    def at(time):
+        zero = jnp.zeros(3)
+        return PositionCommand(
+            position_m=jnp.asarray(there, jnp.float32), velocity_m_s=zero, acceleration_m_s2=zero, yaw_rad=0.0 * time
+        )
+
+    params = params_of(name)
+    start = airborne(params, height=100.0, speed=hover_speed(params))
+    states, _, _ = fly_controlled(params, at, 12.0, state=start, name=name)
+    return (states.body.position_m[:, axis] - (100.0 if axis == 2 else 0.0)) / metres
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize("metres", [2.0, 5.0, 10.0])
+@pytest.mark.parametrize("name", TYPES)
+def test_steps_hardly_overshoot_and_settle(name, metres, axis):
+    x = response(name, metres, axis)
+    assert x.max() < 1.03
+    outside = np.flatnonzero(np.abs(x - 1.0) > 0.02)[-1] * 0.01
+    assert outside < (3.0 if metres <= 5.0 else 4.5)  # 10 m up take 3.3 s at the largest rate of climb
+    assert abs(x[-1] - 1.0) < 0.002
+
+
+@pytest.mark.parametrize("wind", [0.0, 5.0])
+@pytest.mark.parametrize("name", TYPES)
+def test_keeps_up_at_the_largest_speed(name, wind):
+    params = params_of(name)
+    top = float(params.control.speed_max_m_s)
+
+    def at(time):
+        ramp = jnp.minimum(time, top / 2.0)
+        east, zero = ramp * ramp + top * (time - ramp), 0.0 * time
+        acceleration = jnp.where(time < top / 2.0, 2.0, 0.0)
+        return PositionCommand(
+            position_m=jnp.stack([east, zero, zero + 100.0]), velocity_m_s=jnp.stack([2.0 * ramp, zero, zero]),
+            acceleration_m_s2=jnp.stack([acceleration, zero, zero]), yaw_rad=zero,
+        )  # fmt: skip
+
+    start = airborne(params, height=100.0, speed=hover_speed(params))
+    states, _, _ = fly_controlled(params, at, 20.0, state=start, wind=wind, name=name)
+    time = 0.01 * np.arange(1, 2001)
+    ramp = np.minimum(time, top / 2)
+    behind = ramp**2 + top * (time - ramp) - states.body.position_m[:, 0]
+    assert np.abs(behind).max() < 0.06 * top
+    assert np.abs(behind[-1]) < 0.02
+
+
 def landing(time):
     """Down from 3 m at 0.5 m/s, on into the ground."""
     zero = 0.0 * time

@@ -81,7 +81,10 @@ def test_gradients_equal_central_differences(engine):
             difference[(slice(None), *index)] = np.subtract(*np.asarray(ends, np.float64)) / 0.04
         assert np.isfinite(found).all()
         largest = np.abs(difference).max(axis=tuple(range(1, difference.ndim)), keepdims=True)
-        assert np.all(np.abs(found - difference) < 0.01 * largest + 2e-4), name
+        rounding = (
+            2e-6 * np.abs(value).reshape(-1, *(1,) * leaf.ndim) / 0.04
+        )  # of two float32 values over their distance
+        assert np.all(np.abs(found - difference) < 0.01 * largest + 2e-4 + rounding), name
     assert np.abs(gradient["position_m"]).max() > 0.1
     assert gradient["activity"][4] > 1.0
     assert gradient["mass"][3] > 1.0
