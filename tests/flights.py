@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim.config.flight import FlightEffects
 from swarmsim.config.load import load_named
 from swarmsim.config.vehicles import Multirotor
 from swarmsim.control.multirotor import control, control_start
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.multirotor import make_multirotor_step, rest_state
 from swarmsim.physics.wind import gust_noise, gust_start, gust_step, gust_velocity, steady_wind
+from swarmsim.vehicles.battery import open_circuit_voltage
 from swarmsim.vehicles.multirotor import MultirotorParams, multirotor_params
 from swarmsim.vehicles.state import MultirotorState, RigidState
 
@@ -28,8 +30,12 @@ def spec_of(name: str = "tarot_t650") -> Multirotor:
     return load_named("vehicles", name)
 
 
-def params_of(name: str = "tarot_t650") -> MultirotorParams:
-    return multirotor_params(spec_of(name))
+PLAIN = FlightEffects(**dict.fromkeys(FlightEffects.model_fields, False))
+"""Rotors as in still air, whatever the air does, and a battery of constant voltage: what closed forms describe."""
+
+
+def params_of(name: str = "tarot_t650", effects: FlightEffects | None = None) -> MultirotorParams:
+    return multirotor_params(spec_of(name), effects)
 
 
 def plane(slope_deg: float = 0.0) -> Plane:
@@ -52,6 +58,7 @@ def airborne(params: MultirotorParams, *, height=100.0, speed=0.0, rate=(0.0, 0.
         contact_slip_m=jnp.zeros_like(params.contact_position_m),
         ground_force_n=jnp.zeros(()),
         energy_j=jnp.zeros(()),
+        voltage_v=open_circuit_voltage(params.battery, jnp.ones(())),
     )
 
 

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec2
+from swarmsim.config.flight import FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
 from swarmsim.config.vehicles import Vehicle
 
@@ -207,6 +208,7 @@ class Mission(Model):
     sources: tuple[Source, ...] = Field(max_length=16)
     vehicles: tuple[TeamMember, ...] = Field(min_length=1, max_length=TEAM_MAX)
     wind: Wind = Wind()
+    effects: FlightEffects = FlightEffects()
     traffic: Traffic = Traffic()
     radio: Radio = Radio()
     mapping: Mapping | None = None

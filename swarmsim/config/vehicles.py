@@ -69,6 +69,13 @@ class Battery(Model):
     avionics_power_w: NonNegative
 
 
+class FlightBattery(Battery):
+    """Lithium-polymer pack of a multirotor: its cells in series and its resistance."""
+
+    cells: Annotated[int, Field(ge=1)]
+    resistance_ohm: NonNegative
+
+
 class Rotor(Model):
     """One rotor's place (body FLU) and the sense in which it turns seen from above."""
 
@@ -77,9 +84,13 @@ class Rotor(Model):
 
 
 class RotorModel(Model):
-    """Propeller and motor: thrust = k w^2, torque = c thrust, first-order lag of the speed.
+    """Propeller and motor: thrust = k w^2, yaw torque = c thrust, first-order lag of the speed.
 
-    The motor turns between ``speed_min_rad_s`` (idle) and ``speed_max_rad_s``, or stands still when it is disarmed.
+    The motor turns between ``speed_min_rad_s`` (idle) and ``speed_max_rad_s``, or stands still when it is disarmed;
+    below ``speed_max_voltage_v`` at the battery the largest speed falls with the voltage. ``figure_of_merit`` is ideal
+    over shaft power in hover. ``solidity`` (blade area over disc area) makes the thrust depend on the air's motion,
+    ``drag_kg`` and ``rolling_moment_kg_m`` are N and N m per rotor speed and speed across the rotor's axis; what is not
+    given is left out.
     """
 
     thrust_coefficient_n_s2: Positive
@@ -88,8 +99,13 @@ class RotorModel(Model):
     time_constant_down_s: Positive
     speed_min_rad_s: NonNegative
     speed_max_rad_s: Positive
+    speed_max_voltage_v: Positive
     inertia_kg_m2: NonNegative
     radius_m: Positive
+    figure_of_merit: Annotated[float, Field(gt=0, le=1)]
+    solidity: Positive | None = None
+    drag_kg: NonNegative | None = None
+    rolling_moment_kg_m: NonNegative | None = None
 
 
 class Feet(Model):
@@ -126,7 +142,8 @@ class Multirotor(Sourced):
     """A multirotor (``configs/vehicles/<name>.yaml``).
 
     ``collision_radius_m`` and ``collision_height_m`` are those of the upright cylinder around the vehicle, propellers
-    and feet included.
+    and feet included. ``drag_quadratic_kg_m`` is the airframe's drag over the squared airspeed, or one such number
+    along each body axis.
     """
 
     kind: Literal["multirotor"]
@@ -136,12 +153,12 @@ class Multirotor(Sourced):
     inertia_kg_m2: PositiveVec3
     rotors: tuple[Rotor, ...] = Field(min_length=3)
     rotor: RotorModel
-    drag_quadratic_kg_m: Annotated[float, Field(ge=0)]
+    drag_quadratic_kg_m: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
     feet: Feet
     collision_radius_m: Positive
     collision_height_m: Positive
     impact_speed_max_m_s: Positive
-    battery: Battery
+    battery: FlightBattery
     control: MultirotorControl
     detector: DetectorMount | None = None
     body: BodyFile | None = None

@@ -23,6 +23,11 @@ LANDED_AFTER_S = 0.4
 """How long the ground must stop a commanded descent before the vehicle counts as landed."""
 LANDED_LOAD = 0.02
 """Load on the landing gear, over the weight, from which it feels the ground."""
+RATE_INTEGRAL_1_S = 4.0 / 3.0
+"""Integral over proportional gain of the body rates (PX4's defaults MC_ROLLRATE_I 0.2 and MC_ROLLRATE_P 0.15): it holds
+against moments such as that of rotors in an air flow, above the centre of mass."""
+RATE_ERROR_MAX = 1.0
+"""Rate error [rad/s] beyond which the integral grows no faster."""
 CATCH_UP = 0.2
 """Share of the commanded speed by which a vehicle that has fallen behind may exceed its largest speed."""
 LANDED_DESCENT_M_S = 0.2
@@ -38,6 +43,7 @@ class ControlMemory:
     disturbance_m_s2: jax.Array  # [3] m/s^2, world: estimated acceleration by wind, payload and model error
     velocity_m_s: jax.Array  # [3] m/s, world: predicted from thrust, attitude and disturbance
     thrust_m_s2: jax.Array  # [] predicted thrust over the nominal mass; 0 with the motors off
+    rate_integral_rad_s: jax.Array  # [3] rad/s, body: integral of the rate error by its gain
     stuck_s: jax.Array  # [] s for which the ground has stopped a commanded descent: landed from LANDED_AFTER_S on
 
 
@@ -47,6 +53,7 @@ def control_start(*, landed: bool = False) -> ControlMemory:
         disturbance_m_s2=jnp.zeros(3),
         velocity_m_s=jnp.zeros(3),
         thrust_m_s2=jnp.zeros(()),
+        rate_integral_rad_s=jnp.zeros(3),
         stuck_s=jnp.asarray(LANDED_AFTER_S if landed else 0.0, jnp.float32),
     )
 
@@ -77,19 +84,34 @@ def control(
     pull = acceleration + jnp.array([0.0, 0.0, GRAVITY_M_S2], acceleration.dtype)
     pull_body = to_body(attitude, pull)
     rate = _body_rate(autopilot, attitude, pull_body, command.yaw_rad)
-    thrust = autopilot.mass_kg * jnp.maximum(pull_body[2], 0.0)
+    damping = autopilot.climb_damping_1_s * jnp.sum(attitude[:, 2] * body.velocity_m_s)
+    thrust = autopilot.mass_kg * jnp.maximum(pull_body[2] + damping, 0.0)
     if isinstance(command, PositionCommand):
-        speeds = jnp.where(stuck >= LANDED_AFTER_S, 0.0, _rotor_speeds_of(autopilot, body, rate, thrust))
-        return speeds, replace(memory, thrust_m_s2=_thrust_after(autopilot, memory, speeds, dt), stuck_s=stuck)
+        integral = _rate_integral(memory, body, rate, touching, dt)
+        speeds = _rotor_speeds_of(autopilot, body, rate, integral, thrust)
+        speeds = jnp.where(stuck >= LANDED_AFTER_S, 0.0, speeds)
+        given = _thrust_after(autopilot, memory, speeds, dt)
+        return speeds, replace(memory, thrust_m_s2=given, rate_integral_rad_s=integral, stuck_s=stuck)
     at_position = command.level == POSITION
     wanted = jnp.where(command.level == ATTITUDE, _attitude_rate(autopilot, body, command), command.body_rate_rad_s)
     rate = jnp.where(at_position, rate, wanted)
     thrust = jnp.where(at_position, thrust, jnp.maximum(command.thrust_n, 0.0))
-    speeds = _rotor_speeds_of(autopilot, body, rate, thrust)
+    integral = _rate_integral(memory, body, rate, touching, dt)
+    speeds = _rotor_speeds_of(autopilot, body, rate, integral, thrust)
     speeds = jnp.where(at_position & (stuck >= LANDED_AFTER_S), 0.0, speeds)
     speeds = jnp.where(command.level <= BODY_RATE, speeds, command.rotor_speed_rad_s)
     stuck = jnp.where(at_position, stuck, memory.stuck_s)
-    return speeds, replace(memory, thrust_m_s2=_thrust_after(autopilot, memory, speeds, dt), stuck_s=stuck)
+    given = _thrust_after(autopilot, memory, speeds, dt)
+    return speeds, replace(memory, thrust_m_s2=given, rate_integral_rad_s=integral, stuck_s=stuck)
+
+
+def _rate_integral(
+    memory: ControlMemory, body: RigidState, rate: jax.Array, touching: jax.Array, dt: float
+) -> jax.Array:
+    """Integral [3] rad/s of the rate error over time, which starts anew on the ground."""
+    error = rate - body.angular_velocity_rad_s
+    grown = memory.rate_integral_rad_s + dt * RATE_INTEGRAL_1_S * jnp.clip(error, -RATE_ERROR_MAX, RATE_ERROR_MAX)
+    return jnp.where(touching | (memory.thrust_m_s2 <= 0.0), 0.0, grown)
 
 
 def _thrust_after(autopilot: ControlParams, memory: ControlMemory, speed_rad_s: jax.Array, dt: float) -> jax.Array:
@@ -111,27 +133,31 @@ def _observed(
     """The memory with disturbance and velocity of now.
 
     An observer of the velocity with both poles at the root of ``velocity_integral_1_s2``. Its prediction takes the
-    attitude as it is and the thrust that the motors can give, so that neither a step nor a limit winds it up, as they
-    do an integral of the control error. On the ground and with the motors off it waits.
+    attitude as it is and the thrust that the motors can give, less what the inflow of a climb takes of it, so that
+    neither a step nor a limit winds it up, as they do an integral of the control error. On the ground and with the
+    motors off it waits.
     """
-    predicted = memory.velocity_m_s + dt * (memory.thrust_m_s2 * attitude[:, 2] + memory.disturbance_m_s2)
+    along = memory.thrust_m_s2 - autopilot.climb_damping_1_s * jnp.sum(attitude[:, 2] * body.velocity_m_s)
+    predicted = memory.velocity_m_s + dt * (along * attitude[:, 2] + memory.disturbance_m_s2)
     predicted = predicted - jnp.array([0.0, 0.0, dt * GRAVITY_M_S2], predicted.dtype)
     waits = touching | (memory.thrust_m_s2 <= 0.0)
     error = jnp.where(waits, 0.0, body.velocity_m_s - predicted)
     gain = autopilot.velocity_integral_1_s2
     found = memory.disturbance_m_s2 + dt * gain * error
-    bounds = jnp.stack([autopilot.tilt_max_tan * GRAVITY_M_S2, autopilot.acceleration_max_m_s2])
+    most = autopilot.tilt_max_tan * GRAVITY_M_S2
     return replace(
         memory,
-        disturbance_m_s2=_limited(found, bounds),
+        disturbance_m_s2=_limited(found, jnp.stack([most, most])),
         velocity_m_s=jnp.where(waits, body.velocity_m_s, predicted + 2.0 * dt * jnp.sqrt(gain) * error),
     )
 
 
-def _rotor_speeds_of(autopilot: ControlParams, body: RigidState, rate: jax.Array, thrust: jax.Array) -> jax.Array:
+def _rotor_speeds_of(
+    autopilot: ControlParams, body: RigidState, rate: jax.Array, integral: jax.Array, thrust: jax.Array
+) -> jax.Array:
     """Rotor speeds [R] rad/s for body rates [3] rad/s and a collective thrust [] N."""
     w, inertia = body.angular_velocity_rad_s, autopilot.inertia_kg_m2
-    torque = inertia * autopilot.rate_gain_1_s * (rate - w) + jnp.cross(w, inertia * w)
+    torque = inertia * autopilot.rate_gain_1_s * (rate - w + integral) + jnp.cross(w, inertia * w)
     return rotor_commands(autopilot, thrust, torque)
 
 

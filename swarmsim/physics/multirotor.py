@@ -21,6 +21,7 @@ from swarmsim.physics.rigid_body import free_body_step, rates_after, torque_of_e
 from swarmsim.physics.rotations import from_yaw, multiply, rotation_matrix, to_body, to_world
 from swarmsim.pytree import pytree
 from swarmsim.scalars import Layout, over_vehicles
+from swarmsim.vehicles.battery import open_circuit_voltage, under_load
 from swarmsim.vehicles.multirotor import (
     MultirotorParams,
     battery_power,
@@ -46,7 +47,8 @@ class Loads:
     rotor_speed_rad_s: jax.Array  # [R] rad/s at the end of the step
     contact_slip_m: jax.Array  # [C, 3] m, body, at the end of the step
     ground_force_n: jax.Array  # [] N along the ground's normal
-    power_w: jax.Array  # [] W from the battery
+    power_w: jax.Array  # [] W that the battery's cells give
+    voltage_v: jax.Array  # [] V at its terminals
 
 
 def make_multirotor_step(engine: Engine, dt: float, layout: Layout = "scalars") -> Step:
@@ -83,6 +85,7 @@ def make_multirotor_step(engine: Engine, dt: float, layout: Layout = "scalars") 
             contact_slip_m=loads.contact_slip_m,
             ground_force_n=loads.ground_force_n,
             energy_j=state.energy_j + dt * loads.power_w,
+            voltage_v=loads.voltage_v,
         )
 
     return step
@@ -114,13 +117,14 @@ def step_loads(
     height = jnp.sum((body.position_m - ground.point_m) * ground.normal)
     contact_height = height + jnp.sum(params.contact_position_m * normal, axis=-1)
     rotor_height = height + jnp.sum(params.rotor_position_m * normal, axis=-1)
-    speed = rotor_speeds(params, state.rotor_speed_rad_s, rotor_command_rad_s, dt)
+    speed = rotor_speeds(params, state.rotor_speed_rad_s, rotor_command_rad_s, state.voltage_v, dt)
     air_force, air_torque = wrench(
         params,
         speed_before_rad_s=state.rotor_speed_rad_s,
         speed_after_rad_s=speed,
         rotor_height_m=rotor_height,
         air_velocity_m_s=velocity - to_body(attitude, wind_m_s),
+        angular_velocity_rad_s=body.angular_velocity_rad_s,
         dt=dt,
     )
     ground_force, ground_torque, slip = contact_wrench(
@@ -132,6 +136,8 @@ def step_loads(
         angular_velocity_rad_s=body.angular_velocity_rad_s,
         dt=dt,
     )
+    power = battery_power(params, speed_before_rad_s=state.rotor_speed_rad_s, speed_after_rad_s=speed, dt=dt)
+    voltage, drawn = under_load(params.battery, state.energy_j, power)
     return Loads(
         force_n=to_world(attitude, air_force + ground_force),
         torque_nm=air_torque + ground_torque,
@@ -139,7 +145,8 @@ def step_loads(
         rotor_speed_rad_s=speed,
         contact_slip_m=slip,
         ground_force_n=jnp.sum(ground_force * normal),
-        power_w=battery_power(params, speed_before_rad_s=state.rotor_speed_rad_s, speed_after_rad_s=speed, dt=dt),
+        power_w=drawn,
+        voltage_v=voltage,
     )
 
 
@@ -176,6 +183,7 @@ def rest_state(params: MultirotorParams, ground: Plane, yaw_rad: jax.Array) -> M
         contact_slip_m=jnp.zeros_like(params.contact_position_m),
         ground_force_n=params.mass_kg * GRAVITY_M_S2 * ground.normal[2],
         energy_j=jnp.zeros(()),
+        voltage_v=open_circuit_voltage(params.battery, jnp.ones(())),
     )
 
 

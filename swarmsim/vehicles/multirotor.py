@@ -11,12 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.config.vehicles import Multirotor
+from swarmsim.config.flight import FlightEffects
+from swarmsim.config.vehicles import Multirotor, RotorModel
 from swarmsim.pytree import on_device, pytree
+from swarmsim.vehicles.battery import BatteryParams
+from swarmsim.vehicles.rotors import AIR_DENSITY_KG_M3, RotorAir, thrusts
 from swarmsim.vehicles.state import GRAVITY_M_S2
 
-GROUND_EFFECT_HEIGHT_MIN = 0.5
-"""Lowest rotor height in propeller radii at which the ground effect is evaluated: the theory holds above it."""
+LIFT_SLOPE = 5.73
+"""Lift over angle of attack [1/rad] of a rotor blade's section (Leishman, section 2.14.1: 0.1 per degree)."""
 
 
 @pytree
@@ -30,6 +33,7 @@ class ControlParams:
     speed_min_rad_s: jax.Array  # [] rad/s
     speed_max_rad_s: jax.Array  # [] rad/s
     rotor_time_constant_s: jax.Array  # [] s, nominal: mean of rising and falling
+    climb_damping_1_s: jax.Array  # [] deceleration by the rotors' inflow over the speed along their axes, nominal
     position_gain_1_s: jax.Array  # []
     velocity_gain_1_s: jax.Array  # []
     velocity_integral_1_s2: jax.Array  # []
@@ -52,14 +56,16 @@ class MultirotorParams:
     rotor_position_m: jax.Array  # [R, 3] m, body
     rotor_spin: jax.Array  # [R] +1 counter-clockwise seen from above, -1 clockwise
     thrust_coefficient_n_s2: jax.Array  # [] N/(rad/s)^2
-    moment_constant_m: jax.Array  # [] m, torque over thrust
+    moment_constant_m: jax.Array  # [] m, yaw torque over thrust
+    shaft_torque_nms2: jax.Array  # [] N m/(rad/s)^2 that the motor works against
     time_constant_up_s: jax.Array  # [] s, speed rising
     time_constant_down_s: jax.Array  # [] s, speed falling
     speed_min_rad_s: jax.Array  # [] rad/s
     speed_max_rad_s: jax.Array  # [] rad/s
+    speed_max_voltage_v: jax.Array  # [] V: below it the largest speed falls with the voltage
     rotor_inertia_kg_m2: jax.Array  # [] kg m^2, of one rotor about its axis
-    rotor_radius_m: jax.Array  # [] m
-    drag_quadratic_kg_m: jax.Array  # [] N/(m/s)^2
+    rotor_air: RotorAir
+    drag_quadratic_kg_m: jax.Array  # [3] N/(m/s)^2 along the body axes
     contact_position_m: jax.Array  # [C, 3] m, body: the feet, then the rotor hubs (on which it lies when it has tipped)
     contact_stiffness_n_m: jax.Array  # [] N/m, normal, of one point
     contact_tangential_n_m: jax.Array  # [] N/m, tangential, of one point
@@ -67,12 +73,13 @@ class MultirotorParams:
     contact_friction: jax.Array  # [] Coulomb coefficient
     drive_efficiency: jax.Array  # [] battery to shaft
     avionics_power_w: jax.Array  # [] W
-    battery_capacity_j: jax.Array  # [] J
+    battery: BatteryParams
     control: ControlParams
 
 
-def multirotor_params(spec: Multirotor) -> MultirotorParams:
-    """The parameters of the vehicle file ``spec`` as float32 arrays."""
+def multirotor_params(spec: Multirotor, effects: FlightEffects | None = None) -> MultirotorParams:
+    """The parameters of the vehicle file ``spec`` as float32 arrays; ``effects`` are all of them by default."""
+    effects = effects or FlightEffects()
     arms = np.array([r.position_m for r in spec.rotors])
     rotor, feet, battery = spec.rotor, spec.feet, spec.battery
     contacts = np.concatenate([np.array(feet.positions_m), arms])
@@ -88,8 +95,9 @@ def multirotor_params(spec: Multirotor) -> MultirotorParams:
         "speed_min_rad_s": rotor.speed_min_rad_s,
         "speed_max_rad_s": rotor.speed_max_rad_s,
         "rotor_inertia_kg_m2": rotor.inertia_kg_m2,
-        "rotor_radius_m": rotor.radius_m,
-        "drag_quadratic_kg_m": spec.drag_quadratic_kg_m,
+        "shaft_torque_nms2": rotor.thrust_coefficient_n_s2 * hover_induced(rotor) / rotor.figure_of_merit,
+        "speed_max_voltage_v": rotor.speed_max_voltage_v if effects.battery_sag else 0.0,
+        "drag_quadratic_kg_m": np.broadcast_to(spec.drag_quadratic_kg_m, 3),
         "contact_position_m": contacts,
         "contact_stiffness_n_m": feet.stiffness_n_m,
         "contact_tangential_n_m": feet.tangential_stiffness_n_m,
@@ -97,13 +105,55 @@ def multirotor_params(spec: Multirotor) -> MultirotorParams:
         "contact_friction": feet.friction,
         "drive_efficiency": battery.drive_efficiency,
         "avionics_power_w": battery.avionics_power_w,
-        "battery_capacity_j": 3600.0 * battery.capacity_wh,
     }
-    return MultirotorParams(**_float32(numbers), control=control_params(spec))
+    pack = {
+        "capacity_j": 3600.0 * battery.capacity_wh,
+        "cells": battery.cells,
+        "resistance_ohm": battery.resistance_ohm if effects.battery_sag else 0.0,
+    }
+    air = _rotor_air(spec, effects)
+    return MultirotorParams(
+        **_float32(numbers),
+        rotor_air=air,
+        battery=BatteryParams(**_float32(pack)),
+        control=control_params(spec, air),
+    )
 
 
-def control_params(spec: Multirotor) -> ControlParams:
-    """The autopilot of the vehicle file ``spec``, with its rotor allocation worked out."""
+def hover_induced(rotor: RotorModel) -> float:
+    """Induced velocity in hover [m/s] over the rotor speed [rad/s]: that of the ideal rotor, sqrt(T / 2 rho A)."""
+    area = np.pi * rotor.radius_m**2
+    return float(np.sqrt(rotor.thrust_coefficient_n_s2 / (2.0 * AIR_DENSITY_KG_M3 * area)))
+
+
+def _rotor_air(spec: Multirotor, effects: FlightEffects) -> RotorAir:
+    """Coefficients of the rotors in moving air, by blade element theory with a uniform inflow.
+
+    With the lift slope a and the solidity sigma, thrust changes by rho A a sigma / 4 per tip speed and inflow; in hover
+    the induced velocity, which follows the thrust, takes the share 1 / (1 + a sigma / 16 lambda) of it (Leishman,
+    sections 3.2 and 3.3).
+    """
+    rotor = spec.rotor
+    induced, area = hover_induced(rotor), np.pi * rotor.radius_m**2
+    lift = LIFT_SLOPE * (rotor.solidity or 0.0)
+    ratio = induced / rotor.radius_m
+    inflow = AIR_DENSITY_KG_M3 * area * 0.25 * lift / (1.0 + lift / (16.0 * ratio))
+    coefficient = rotor.thrust_coefficient_n_s2 / (AIR_DENSITY_KG_M3 * area * rotor.radius_m**2)
+    numbers = {
+        "radius_m": rotor.radius_m,
+        "induced_m": induced,
+        "inflow_kg_m": inflow if effects.inflow else 0.0,
+        "translational_lift_kg_m": inflow if effects.translational_lift else 0.0,
+        "pitch_rad": 3.0 * (2.0 * coefficient / lift + 0.5 * ratio) if lift else 0.0,
+        "drag_kg": (rotor.drag_kg or 0.0) if effects.rotor_drag else 0.0,
+        "rolling_moment_kg_m": (rotor.rolling_moment_kg_m or 0.0) if effects.rolling_moment else 0.0,
+        "ground_effect": 1.0 if effects.ground_effect else 0.0,
+    }
+    return RotorAir(**_float32(numbers))
+
+
+def control_params(spec: Multirotor, air: RotorAir) -> ControlParams:
+    """The autopilot of the vehicle file ``spec`` with rotors in ``air``, its rotor allocation worked out."""
     gains, rotor = spec.control, spec.rotor
     numbers = {
         "mass_kg": spec.mass_kg,
@@ -125,6 +175,9 @@ def control_params(spec: Multirotor) -> ControlParams:
         "climb_rate_max_m_s": gains.climb_rate_max_m_s,
         "acceleration_max_m_s2": gains.acceleration_max_m_s2,
     }
+    hover = np.sqrt(GRAVITY_M_S2 * spec.mass_kg / len(spec.rotors) / rotor.thrust_coefficient_n_s2)
+    inflow = float(air.inflow_kg_m) * rotor.radius_m * hover
+    numbers["climb_damping_1_s"] = 0.5 * len(spec.rotors) * inflow / spec.mass_kg
     return ControlParams(**_float32(numbers))
 
 
@@ -135,26 +188,20 @@ def effectiveness(spec: Multirotor) -> np.ndarray:
     return np.stack([np.ones(len(arms)), arms[:, 1], -arms[:, 0], yaw])
 
 
-def rotor_speeds(params: MultirotorParams, speed_rad_s: jax.Array, command_rad_s: jax.Array, dt: float) -> jax.Array:
+def rotor_speeds(
+    params: MultirotorParams, speed_rad_s: jax.Array, command_rad_s: jax.Array, voltage_v: jax.Array, dt: float
+) -> jax.Array:
     """Rotor speeds [R] rad/s after ``dt`` s of the commands [R] rad/s, a first-order lag solved exactly.
 
     A command at or below zero disarms the rotor, which then runs down to rest; any other is held to the motor's range.
+    A motor's speed is bounded by its back-EMF, so that the range ends lower where the battery's ``voltage_v`` [] is
+    low.
     """
-    inside = jnp.clip(command_rad_s, params.speed_min_rad_s, params.speed_max_rad_s)
+    share = jnp.minimum(1.0, voltage_v / jnp.maximum(params.speed_max_voltage_v, 1e-3))
+    inside = jnp.clip(command_rad_s, params.speed_min_rad_s, share * params.speed_max_rad_s)
     target = jnp.where(command_rad_s <= 0.0, 0.0, inside)
     time_constant = jnp.where(target > speed_rad_s, params.time_constant_up_s, params.time_constant_down_s)
     return target + (speed_rad_s - target) * jnp.exp(-dt / time_constant)
-
-
-def ground_effect(height_m: jax.Array, radius_m: jax.Array) -> jax.Array:
-    """Thrust over thrust far from the ground, at equal power, of rotors [...] ``height_m`` above it.
-
-    Cheeseman and Bennett, "The effect of the ground on a helicopter rotor in forward flight" (ARC R&M 3021, 1955), in
-    hover: 1 / (1 - (R / 4 z)^2). The height is held above half a radius, where the theory ends: the factor is at most
-    4/3.
-    """
-    ratio = 0.25 * radius_m / jnp.maximum(height_m, GROUND_EFFECT_HEIGHT_MIN * radius_m)
-    return 1.0 / (1.0 - ratio * ratio)
 
 
 def wrench(
@@ -164,35 +211,42 @@ def wrench(
     speed_after_rad_s: jax.Array,
     rotor_height_m: jax.Array,
     air_velocity_m_s: jax.Array,
+    angular_velocity_rad_s: jax.Array,
     dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Force [3] N and torque [3] N m (body) of rotors and air on the vehicle, mean over a step of ``dt`` s.
 
     ``speed_before_rad_s`` and ``speed_after_rad_s`` [R] are the rotor speeds at the ends of the step,
     ``rotor_height_m`` [R] the hubs' heights above the ground, ``air_velocity_m_s`` [3] the vehicle's velocity through
-    the air (body).
+    the air (body); each rotor meets the air at its own hub.
 
-    Thrust k w^2 along body z; its torque c k w^2 and the reaction to the rotor's acceleration act against the spin
-    (Mahony, Kumar, Corke, "Multirotor aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). The rotors'
-    gyroscopic torque is the integrator's part (`rotor_momentum`). Drag is quadratic against the air velocity, as in the
-    MRS multirotor simulator.
+    Thrust (`swarmsim.vehicles.rotors.thrusts`) along body z; the yaw torque c k w^2 and the reaction to the rotor's
+    acceleration act against the spin (Mahony, Kumar, Corke, "Multirotor aerial vehicles", IEEE Robotics & Automation
+    Magazine 19(3), 2012). Drag and rolling moment in the plane of a rotor are proportional to its speed and to the
+    air's (Martin and Salaun, "The true role of accelerometer feedback in quadrotor control", ICRA 2010). The airframe's
+    drag is quadratic, along each body axis with its own coefficient. The rotors' gyroscopic torque is the integrator's
+    part (`rotor_momentum`).
     """
     speed = 0.5 * (speed_before_rad_s + speed_after_rad_s)
-    free_thrust = params.thrust_coefficient_n_s2 * speed * speed
-    thrust = free_thrust * ground_effect(rotor_height_m, params.rotor_radius_m)
+    place, air = params.rotor_position_m, params.rotor_air
+    hub = air_velocity_m_s + jnp.cross(angular_velocity_rad_s, place)
+    thrust = thrusts(air, params.thrust_coefficient_n_s2, speed, hub, rotor_height_m)
+    across = -air.drag_kg * speed[:, None] * hub[:, :2]
+    roll = -air.rolling_moment_kg_m * jnp.sum(speed[:, None] * hub[:, :2], axis=0)
     acceleration = (speed_after_rad_s - speed_before_rad_s) / dt
+    free_thrust = params.thrust_coefficient_n_s2 * speed * speed
     shaft_torque = params.moment_constant_m * free_thrust + params.rotor_inertia_kg_m2 * acceleration
-    x, y = params.rotor_position_m[:, 0], params.rotor_position_m[:, 1]
+    x, y, z = place[:, 0], place[:, 1], place[:, 2]
     torque = jnp.stack(
         [
-            jnp.sum(y * thrust),
-            -jnp.sum(x * thrust),
-            -jnp.sum(params.rotor_spin * shaft_torque),
+            jnp.sum(y * thrust - z * across[:, 1]) + roll[0],
+            jnp.sum(z * across[:, 0] - x * thrust) + roll[1],
+            jnp.sum(x * across[:, 1] - y * across[:, 0] - params.rotor_spin * shaft_torque),
         ]
     )
     airspeed = jnp.sqrt(jnp.sum(air_velocity_m_s**2) + 1e-12)  # the small term keeps the gradient finite at rest
     drag = -params.drag_quadratic_kg_m * airspeed * air_velocity_m_s
-    return drag + jnp.sum(thrust) * jnp.array([0.0, 0.0, 1.0], drag.dtype), torque
+    return drag + jnp.append(jnp.sum(across, axis=0), jnp.sum(thrust)), torque
 
 
 def rotor_momentum(params: MultirotorParams, speed_rad_s: jax.Array) -> jax.Array:
@@ -206,13 +260,15 @@ def rotor_momentum(params: MultirotorParams, speed_rad_s: jax.Array) -> jax.Arra
 def battery_power(
     params: MultirotorParams, *, speed_before_rad_s: jax.Array, speed_after_rad_s: jax.Array, dt: float
 ) -> jax.Array:
-    """Power [] W drawn from the battery: shaft power over the drive's efficiency, plus the avionics.
+    """Power [] W at the battery's terminals: shaft power over the drive's efficiency, plus the avionics.
 
     A rotor that slows down gives nothing back to the battery.
     """
     speed = 0.5 * (speed_before_rad_s + speed_after_rad_s)
-    drag_torque = params.moment_constant_m * params.thrust_coefficient_n_s2 * speed * speed
-    torque = drag_torque + params.rotor_inertia_kg_m2 * (speed_after_rad_s - speed_before_rad_s) / dt
+    torque = (
+        params.shaft_torque_nms2 * speed * speed
+        + params.rotor_inertia_kg_m2 * (speed_after_rad_s - speed_before_rad_s) / dt
+    )
     return jnp.sum(jnp.maximum(torque * speed, 0.0)) / params.drive_efficiency + params.avionics_power_w
 
 

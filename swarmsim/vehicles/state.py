@@ -30,7 +30,8 @@ class MultirotorState:
     rotor_speed_rad_s: jax.Array  # [R] rad/s, magnitude (the sense of each rotor stands in the parameters)
     contact_slip_m: jax.Array  # [C, 3] m, body: elastic tangential give of each contact point, zero in the air
     ground_force_n: jax.Array  # [] N, of the ground along its normal during the last step: the landing gear's switch
-    energy_j: jax.Array  # [] J drawn from the battery since the start
+    energy_j: jax.Array  # [] J drawn from the battery's cells since the start
+    voltage_v: jax.Array  # [] V at the battery's terminals during the last step
 
 
 @pytree

@@ -132,7 +132,7 @@ def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library
     params: dict[int, Any] = {}
     for spec in specs:
         if id(spec) not in params:  # many members share one specification
-            params[id(spec)] = _params(spec, timing)
+            params[id(spec)] = _params(scenario, spec, timing)
     return Group(
         params=_stack([params[id(spec)] for spec in specs]),
         limits=_limits(specs),
@@ -144,11 +144,11 @@ def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library
     )
 
 
-def _params(spec: Spec, timing: Timing) -> Any:
+def _params(scenario: Scenario, spec: Spec, timing: Timing) -> Any:
     if isinstance(spec, SkidSteer):
         return skid_steer_params(spec)
     check_time_step(spec, timing.time_step_s)
-    return multirotor_params(embodied(spec))
+    return multirotor_params(embodied(spec), scenario.mission.effects)
 
 
 def _limits(specs: Sequence[Spec]) -> Limits:

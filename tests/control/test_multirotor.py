@@ -79,19 +79,18 @@ TYPES = ("tarot_t650", "x500", "dji_f550")
 
 @cache
 def response(name, metres, axis):
-    """Position along ``axis`` over the step's ``metres``, every 10 ms after it."""
-    there = 100.0 * np.eye(3)[2] + metres * np.eye(3)[axis]
+    """Position along ``axis`` over the step's ``metres``, every 10 ms after it; it comes after a second of hover."""
+    there = jnp.asarray(np.eye(3)[axis], jnp.float32)
 
     def at(time):
         zero = jnp.zeros(3)
-        return PositionCommand(
-            position_m=jnp.asarray(there, jnp.float32), velocity_m_s=zero, acceleration_m_s2=zero, yaw_rad=0.0 * time
-        )
+        place = jnp.array([0.0, 0.0, 100.0]) + jnp.where(time > 1.0, metres, 0.0) * there
+        return PositionCommand(position_m=place, velocity_m_s=zero, acceleration_m_s2=zero, yaw_rad=0.0 * time)
 
     params = params_of(name)
     start = airborne(params, height=100.0, speed=hover_speed(params))
-    states, _, _ = fly_controlled(params, at, 12.0, state=start, name=name)
-    return (states.body.position_m[:, axis] - (100.0 if axis == 2 else 0.0)) / metres
+    states, _, _ = fly_controlled(params, at, 13.0, state=start, name=name)
+    return (states.body.position_m[100:, axis] - (100.0 if axis == 2 else 0.0)) / metres
 
 
 @pytest.mark.parametrize("axis", [0, 2])
@@ -125,8 +124,8 @@ def test_keeps_up_at_the_largest_speed(name, wind):
     time = 0.01 * np.arange(1, 2001)
     ramp = np.minimum(time, top / 2)
     behind = ramp**2 + top * (time - ramp) - states.body.position_m[:, 0]
-    assert np.abs(behind).max() < 0.06 * top
-    assert np.abs(behind[-1]) < 0.02
+    assert np.abs(behind).max() < 0.08 * top
+    assert np.abs(behind[-1]) < 0.01 * top
 
 
 def landing(time):

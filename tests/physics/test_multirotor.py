@@ -13,12 +13,13 @@ from swarmsim.control.commands import PositionCommand
 from swarmsim.physics.multirotor import check_time_step, longest_time_step, make_multirotor_step, step_loads
 from swarmsim.physics.rigid_body import rates_after
 from swarmsim.scalars import over_vehicles
-from swarmsim.vehicles.multirotor import multirotor_mjcf
+from swarmsim.vehicles.multirotor import battery_power, multirotor_mjcf
 from tests.flights import (
     CALM,
     DT,
     ENGINES,
     GRAVITY,
+    PLAIN,
     airborne,
     angle_deg,
     attitude,
@@ -39,7 +40,7 @@ engines = pytest.mark.parametrize("engine", ENGINES)
 @engines
 @pytest.mark.parametrize(("name", "speed"), [("tarot_t650", 3420.07 * 2 * np.pi / 60), ("x500", None)])
 def test_hovers_at_its_hover_speed(engine, name, speed):
-    params = params_of(name)
+    params = params_of(name, PLAIN)
     speed = speed or hover_speed(params)
     states = fly(params, airborne(params, speed=speed), speed, steps=N, name=name, engine=engine)
     np.testing.assert_allclose(states.body.position_m[-1], [0, 0, 100.0], atol=2e-3)
@@ -48,7 +49,7 @@ def test_hovers_at_its_hover_speed(engine, name, speed):
 
 @engines
 def test_falls_freely_without_motors_or_air(engine):
-    params = replace(params_of(), drag_quadratic_kg_m=jnp.float32(0.0))
+    params = replace(params_of(effects=PLAIN), drag_quadratic_kg_m=jnp.float32(0.0))
     states = fly(params, airborne(params), 0.0, steps=N, engine=engine)
     k = np.arange(1, N + 1)
     np.testing.assert_allclose(states.body.velocity_m_s[:, 2], -GRAVITY * TIME, rtol=1e-4)
@@ -58,7 +59,7 @@ def test_falls_freely_without_motors_or_air(engine):
 
 @engines
 def test_reaches_its_terminal_velocity(engine):
-    params = params_of()
+    params = params_of(effects=PLAIN)
     states = fly(params, airborne(params, height=400.0), 0.0, steps=4 * N, engine=engine)
     terminal = np.sqrt(3.5 * GRAVITY / 0.0995494)
     time = DT * np.arange(1, 4 * N + 1)
@@ -68,7 +69,7 @@ def test_reaches_its_terminal_velocity(engine):
 
 
 def test_wind_carries_a_still_body():
-    params = params_of()
+    params = params_of(effects=PLAIN)
     speed = hover_speed(params)
     states = fly(params, airborne(params, speed=speed), speed, steps=N, wind=jnp.array([6.0, 0.0, 0.0]))
     # dv/dt = c (W - v)^2 / m from rest: W - v = W / (1 + c W t / m).
@@ -78,7 +79,7 @@ def test_wind_carries_a_still_body():
 
 @engines
 def test_thrust_step_follows_the_rotor_lag(engine):
-    params = replace(params_of(), drag_quadratic_kg_m=jnp.float32(0.0))
+    params = replace(params_of(effects=PLAIN), drag_quadratic_kg_m=jnp.float32(0.0))
     hover = hover_speed(params)
     target = 1.2 * hover
     states = fly(params, airborne(params, speed=hover), target, steps=N, engine=engine)
@@ -95,7 +96,7 @@ def test_thrust_step_follows_the_rotor_lag(engine):
 
 @engines
 def test_yaw_follows_the_torques_and_the_rotors_momentum(engine):
-    params = params_of()
+    params = params_of(effects=PLAIN)
     hover = hover_speed(params)
     spins = np.asarray(params.rotor_spin)
     command = hover * np.sqrt(1 - 0.1 * spins)  # clockwise rotors faster: the body turns counter-clockwise
@@ -117,7 +118,7 @@ def test_yaw_follows_the_torques_and_the_rotors_momentum(engine):
 def test_tumbling_keeps_momentum_and_energy(engine, rotors):
     """Torque-free tumbling, also with flywheels: two rotors that turn the same way and touch no air."""
     params = replace(
-        params_of(),
+        params_of(effects=PLAIN),
         inertia_kg_m2=jnp.array([0.10, 0.14, 0.18]),
         thrust_coefficient_n_s2=jnp.float32(0.0),
         drag_quadratic_kg_m=jnp.float32(0.0),
@@ -148,7 +149,8 @@ def test_thirty_seconds_of_tumbling_keep_the_energy(engine):
     inertia = parts.sum(1, keepdims=True) - parts
     rate = draw.normal(size=(count, 3))
     rate *= np.geomspace(0.3, 20.0, count)[:, None] / np.linalg.norm(rate, axis=1, keepdims=True)
-    still = replace(params_of(), thrust_coefficient_n_s2=jnp.float32(0.0), drag_quadratic_kg_m=jnp.float32(0.0))
+    still = params_of(effects=PLAIN)
+    still = replace(still, thrust_coefficient_n_s2=jnp.float32(0.0), drag_quadratic_kg_m=jnp.float32(0.0))
     step = make_multirotor_step(engine, DT)
 
     def one(inertia, rate):
@@ -232,7 +234,7 @@ def test_mjx_follows_mujoco_c_under_the_same_wrench():
 def test_flight_at_the_usual_step_is_that_of_mujoco_c_at_a_fortieth():
     """Gyroscopic torques included: MuJoCo C with a step of 0.125 ms and the rotors as flywheels of its own terms."""
     params = replace(
-        params_of(), thrust_coefficient_n_s2=jnp.float32(0.0), drag_quadratic_kg_m=jnp.float32(0.0),
+        params_of(effects=PLAIN), thrust_coefficient_n_s2=jnp.float32(0.0), drag_quadratic_kg_m=jnp.float32(0.0),
         inertia_kg_m2=jnp.array([0.10, 0.14, 0.18]),
     )  # fmt: skip
     rate, fine, moments = (2.0, -1.5, 3.0), DT / 40, np.array([0.10, 0.14, 0.18])
@@ -248,7 +250,7 @@ def test_flight_at_the_usual_step_is_that_of_mujoco_c_at_a_fortieth():
 
 @engines
 def test_sweeps_need_no_new_compilation(engine):
-    params = params_of()
+    params = params_of(effects=PLAIN)
     step = make_multirotor_step(engine, DT)
     run = jax.jit(jax.vmap(step, in_axes=(0, None, None, None, None)))
     start = airborne(params, speed=hover_speed(params))
@@ -266,7 +268,7 @@ def test_sweeps_need_no_new_compilation(engine):
 
 @engines
 def test_gradients_are_finite_and_right(engine):
-    params, ground = params_of(), plane()
+    params, ground = params_of(effects=PLAIN), plane()
     step = make_multirotor_step(engine, DT)
     hover = hover_speed(params)
 
@@ -309,10 +311,25 @@ def test_ground_effect_lifts_near_the_ground():
 
 
 def test_energy_is_power_times_time():
+    """Of a battery without resistance; the power is that of `battery_power`, which has tests of its own."""
+    params = params_of(effects=PLAIN)
+    speed = hover_speed(params)
+    states = fly(params, airborne(params, speed=speed), speed, steps=N)
+    every = jnp.full(4, speed)
+    power = float(battery_power(params, speed_before_rad_s=every, speed_after_rad_s=every, dt=DT))
+    assert states.energy_j[-1] == pytest.approx(power * TIME[-1], rel=1e-4)
+
+
+def test_a_pack_with_resistance_gives_more_than_arrives():
     params = params_of()
     speed = hover_speed(params)
     states = fly(params, airborne(params, speed=speed), speed, steps=N)
-    assert states.energy_j[-1] == pytest.approx((0.0399 * 3.5 * GRAVITY * speed / 0.8 + 25.0) * TIME[-1], rel=1e-4)
+    every = jnp.full(4, speed)
+    power = float(battery_power(params, speed_before_rad_s=every, speed_after_rad_s=every, dt=DT))
+    current = power / states.voltage_v[-1]
+    lost = 0.012 * current**2
+    assert states.energy_j[-1] == pytest.approx((power + lost) * TIME[-1], rel=1e-3)
+    assert states.voltage_v[-1] == pytest.approx(6 * 4.103 - 0.012 * current, rel=2e-3)
 
 
 def test_bad_choices_are_refused():

@@ -25,7 +25,7 @@ from swarmsim.physics.rotations import from_yaw
 from swarmsim.world.model import World
 from swarmsim.world.state import WorldState
 from swarmsim.world.step import full_commands, hold, step
-from tests.flights import attitude
+from tests.flights import PLAIN, attitude
 from tests.world.worlds import (
     ROVERS,
     TICK_S,
@@ -113,7 +113,8 @@ def tilted(angle: float, axis: int) -> np.ndarray:
     return quaternion
 
 
-def test_an_attitude_is_taken_and_accelerates_as_its_tilt_says(world, start):
+def test_an_attitude_is_taken_and_accelerates_as_its_tilt_says(start):
+    world = team(effects=PLAIN)
     angle, up = 0.15, airborne(world, start, HIGH)
     wanted = tilted(angle, 1)  # nose down: forward
     command = AttitudeCommand(quaternion=jnp.asarray(wanted), thrust_n=jnp.float32(weight(world) / np.cos(angle)))
@@ -121,7 +122,7 @@ def test_an_attitude_is_taken_and_accelerates_as_its_tilt_says(world, start):
     np.testing.assert_allclose(tracks[0].quaternion[-1], np.tile(wanted, (UAVS, 1)), atol=0.01)
     rise = (tracks[0].velocity_m_s[-1] - tracks[0].velocity_m_s[-51]) / 0.5
     speed = tracks[0].velocity_m_s[-26, 0, 0]
-    drag = float(world.groups[0].params.drag_quadratic_kg_m[0]) * speed**2 / weight(world) * GRAVITY
+    drag = float(world.groups[0].params.drag_quadratic_kg_m[0, 0]) * speed**2 / weight(world) * GRAVITY
     np.testing.assert_allclose(rise[:, 0], GRAVITY * np.tan(angle) - drag, rtol=0.03)
     np.testing.assert_allclose(rise[:, 1:], 0.0, atol=0.05)
 
@@ -135,7 +136,8 @@ def test_body_rates_are_followed(world, start):
     np.testing.assert_allclose(tracks[0].position_m[-1, :, 2], 12.0, atol=0.1)
     roll = BodyRateCommand(body_rate_rad_s=jnp.array([0.4, 0.0, 0.0]), thrust_n=jnp.float32(weight(world)))
     _, tracks = fly(world, up, (every(roll), stay(world, start)[1]), 0.5)
-    np.testing.assert_allclose(tracks[0].angular_velocity_rad_s[-1, :, 0], 0.4, atol=0.03)
+    # The rotors' inflow resists a roll, and the integral makes it good within a second.
+    np.testing.assert_allclose(tracks[0].angular_velocity_rad_s[-1, :, 0], 0.4, atol=0.05)
 
 
 def test_rotor_speeds_at_hover_keep_the_height_and_faster_ones_climb(world, start):

@@ -63,12 +63,12 @@ UAVS, ROVERS = 5, 2
 
 
 @cache
-def team() -> World:
+def team(**mission: Any) -> World:
     """Five x500 with a detector of 1 Hz, and two Orpheus with one of 0.09 s."""
     uavs = row("uav", "x500", UAVS, (-30.0, -20.0))
     rovers = row("rover", "orpheus", ROVERS, (-30.0, 0.0))
     # the x500 carries the model that samples each 0.09 s, the rover the one of 1.05 s: here it is the other way round
-    return world(uavs + rovers, sample_period_s={"nai_1p5x1p5": 1.0, "nai_2x2": 0.09})
+    return world(uavs + rovers, sample_period_s={"nai_1p5x1p5": 1.0, "nai_2x2": 0.09}, **mission)
 
 
 begin = jax.jit(reset, static_argnames="active")
