@@ -9,13 +9,16 @@ import jax.numpy as jnp
 
 from swarmsim.pytree import pytree
 
+SLIP_M_S = 0.1
+"""Slip along a wall at which its friction is 71 % of that of Coulomb."""
+
 
 @pytree
 class Plane:
-    """Tangent plane of the ground below a vehicle."""
+    """Tangent plane of the ground below a vehicle, or of a wall beside it."""
 
     point_m: jax.Array  # [3] m, world: any point of it
-    normal: jax.Array  # [3] unit vector, world, out of the ground
+    normal: jax.Array  # [3] unit vector, world, out of the ground or the wall
 
 
 @pytree
@@ -64,6 +67,33 @@ def contact_wrench(
     share = jnp.minimum(1.0, cone * jax.lax.rsqrt(jnp.sum(stick * stick, axis=-1) + 1e-6))[:, None]
     force = share * stick + push[:, None] * normal
     return jnp.sum(force, axis=0), jnp.sum(_cross(points.position_m, force), axis=0), share * give
+
+
+def wall_wrench(
+    points: ContactPoints,
+    *,
+    radius_m: jax.Array,
+    distance_m: jax.Array,
+    normal: jax.Array,
+    velocity_m_s: jax.Array,
+    angular_velocity_rad_s: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Force [3] N and torque [3] N m about the body's origin (body frame) of an upright wall on the body's rim.
+
+    The rim is a circle of ``radius_m`` [] about the body's origin; its point nearest to the wall meets a spring and
+    damper as stiff as a contact point, and Coulomb friction that grows with the slip up to `SLIP_M_S`. ``distance_m``
+    [] is that of the origin from the wall, ``normal`` [3] points out of it (body frame).
+    """
+    arm = -radius_m * normal
+    velocity = velocity_m_s + _cross(angular_velocity_rad_s, arm)
+    closing = jnp.sum(velocity * normal)
+    depth = radius_m - distance_m
+    push = jnp.maximum(points.stiffness_n_m * depth - points.damping_n_s_m * closing, 0.0)
+    push = jnp.where(depth > 0.0, push, 0.0)
+    along = velocity - closing * normal
+    slip = jax.lax.rsqrt(jnp.sum(along * along) + SLIP_M_S * SLIP_M_S)
+    force = push * (normal - points.friction * slip * along)
+    return force, _cross(arm, force)
 
 
 def _cross(a: jax.Array, b: jax.Array) -> jax.Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import Multirotor
-from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench
+from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench, wall_wrench
 from swarmsim.physics.rigid_body import free_body_step, rates_after, torque_of_euler_step
 from swarmsim.physics.rotations import from_yaw, multiply, rotation_matrix, to_body, to_world
 from swarmsim.pytree import pytree
@@ -33,7 +33,7 @@ from swarmsim.vehicles.multirotor import (
 from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
 
 Engine = Literal["mjx", "analytic"]
-Step = Callable[[MultirotorParams, MultirotorState, jax.Array, jax.Array, Plane], MultirotorState]
+Step = Callable[..., MultirotorState]
 Integrate = Callable[[MultirotorParams, RigidState, jax.Array, jax.Array, jax.Array], RigidState]
 
 
@@ -52,7 +52,9 @@ class Loads:
 
 
 def make_multirotor_step(engine: Engine, dt: float, layout: Layout = "scalars") -> Step:
-    """The function ``step(params, state, rotor_command_rad_s [R], wind_m_s [3] world, ground) -> state`` over ``dt`` s.
+    """The function ``step(params, state, rotor_command_rad_s [R], wind_m_s [3] world, ground[, wall]) -> state``.
+
+    It goes over ``dt`` s; ``ground`` and ``wall`` are the `Plane` below and the one beside the vehicle.
 
     Everything about the vehicle comes from ``params``, so that masses, drags and the like are swept without compiling
     anew. A command at or below zero disarms its rotor. The step is pure, of one vehicle, and has no loop that a
@@ -77,8 +79,9 @@ def make_multirotor_step(engine: Engine, dt: float, layout: Layout = "scalars") 
         rotor_command_rad_s: jax.Array,
         wind_m_s: jax.Array,
         ground: Plane,
+        wall: Plane | None = None,
     ) -> MultirotorState:
-        loads = step_loads(params, state, rotor_command_rad_s, wind_m_s, ground, dt)
+        loads = step_loads(params, state, rotor_command_rad_s, wind_m_s, ground, dt, wall)
         return MultirotorState(
             body=integrate(params, state.body, loads.force_n, loads.torque_nm, loads.rotor_momentum_nms),
             rotor_speed_rad_s=loads.rotor_speed_rad_s,
@@ -108,6 +111,7 @@ def step_loads(
     wind_m_s: jax.Array,
     ground: Plane,
     dt: float,
+    wall: Plane | None = None,
 ) -> Loads:
     """Loads on the vehicle over a step of ``dt`` s; the wind [3] m/s is the air's velocity in the world."""
     body = state.body
@@ -136,11 +140,22 @@ def step_loads(
         angular_velocity_rad_s=body.angular_velocity_rad_s,
         dt=dt,
     )
+    force, torque = air_force + ground_force, air_torque + ground_torque
+    if wall is not None:
+        push, turn = wall_wrench(
+            contact_points(params),
+            radius_m=params.collision_radius_m,
+            distance_m=jnp.sum((body.position_m - wall.point_m) * wall.normal),
+            normal=to_body(attitude, wall.normal),
+            velocity_m_s=velocity,
+            angular_velocity_rad_s=body.angular_velocity_rad_s,
+        )
+        force, torque = force + push, torque + turn
     power = battery_power(params, speed_before_rad_s=state.rotor_speed_rad_s, speed_after_rad_s=speed, dt=dt)
     voltage, drawn = under_load(params.battery, state.energy_j, power)
     return Loads(
-        force_n=to_world(attitude, air_force + ground_force),
-        torque_nm=air_torque + ground_torque,
+        force_n=to_world(attitude, force),
+        torque_nm=torque,
         rotor_momentum_nms=rotor_momentum(params, speed),
         rotor_speed_rad_s=speed,
         contact_slip_m=slip,

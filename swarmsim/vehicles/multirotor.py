@@ -66,6 +66,7 @@ class MultirotorParams:
     rotor_inertia_kg_m2: jax.Array  # [] kg m^2, of one rotor about its axis
     rotor_air: RotorAir
     drag_quadratic_kg_m: jax.Array  # [3] N/(m/s)^2 along the body axes
+    collision_radius_m: jax.Array  # [] m, of the upright cylinder around it
     contact_position_m: jax.Array  # [C, 3] m, body: the feet, then the rotor hubs (on which it lies when it has tipped)
     contact_stiffness_n_m: jax.Array  # [] N/m, normal, of one point
     contact_tangential_n_m: jax.Array  # [] N/m, tangential, of one point
@@ -98,6 +99,7 @@ def multirotor_params(spec: Multirotor, effects: FlightEffects | None = None) ->
         "shaft_torque_nms2": rotor.thrust_coefficient_n_s2 * hover_induced(rotor) / rotor.figure_of_merit,
         "speed_max_voltage_v": rotor.speed_max_voltage_v if effects.battery_sag else 0.0,
         "drag_quadratic_kg_m": np.broadcast_to(spec.drag_quadratic_kg_m, 3),
+        "collision_radius_m": spec.collision_radius_m,
         "contact_position_m": contacts,
         "contact_stiffness_n_m": feet.stiffness_n_m,
         "contact_tangential_n_m": feet.tangential_stiffness_n_m,

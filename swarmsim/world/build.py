@@ -19,6 +19,7 @@ from swarmsim.radiation.library import Library
 from swarmsim.sensors.radiation import Counter
 from swarmsim.site import SiteModel
 from swarmsim.site.model import height_at
+from swarmsim.site.walls import walls_of
 from swarmsim.vehicles.multirotor import multirotor_params
 from swarmsim.vehicles.skid_steer import skid_steer_params
 from swarmsim.world.model import Air, Group, Limits, Radio, Timing, TrafficRules, World
@@ -67,6 +68,7 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
     radio = mission.radio
     return World(
         site=site,
+        walls=walls_of(site),
         sources=_sources(scenario, site_model, library),
         air=Air(
             speed_m_s=_f32(mission.wind.speed_m_s),

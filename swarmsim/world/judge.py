@@ -9,10 +9,11 @@ import jax.numpy as jnp
 from swarmsim import randomness
 from swarmsim.physics.wind import GUST_NOISE, gust_noise, gust_step, gust_velocity, steady_wind
 from swarmsim.scalars import over_vehicles
+from swarmsim.site import sample
 from swarmsim.world import events
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
-from swarmsim.world.multirotor import ground_below
+from swarmsim.world.multirotor import ground_below, wall_beside
 from swarmsim.world.radio import broadcast
 from swarmsim.world.right_of_way import kept_aside, right_of_way
 from swarmsim.world.state import GroupState, Surroundings, WorldState
@@ -41,7 +42,7 @@ def record_events(
     kind = KINDS[kind_name]
     height, impact = state.around.height_m, state.impact_m_s
     crash = kind.crashed(params, state.vehicle, height, impact, limits)
-    obstacle = kind.obstructed(params, state.vehicle, impact, limits, world.site)
+    obstacle = kind.obstructed(params, state.vehicle, state.around.wall, impact, limits, world.site)
     empty = state.vehicle.energy_j > limits.battery_j
     happened = jnp.stack([crash, obstacle, collided, empty, jnp.array(False)]) & state.finite
     happened = happened.at[events.NON_FINITE].set(~state.finite) & state.active
@@ -55,14 +56,15 @@ def _refreshed(
     """What is around a group's vehicles, with ground, height and wind where they are now if it is running."""
     kind = KINDS[group.kind]
 
-    def anew(noise: jax.Array | None, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
+    def anew(noise: jax.Array | None, params: Any, limits: Limits, vehicle: Any, around: Surroundings) -> Surroundings:
         body = vehicle.body
         ground = ground_below(world.site, body.position_m)
         height = kind.height(params, vehicle, ground)
         if noise is None:
             return replace(around, ground=ground, height_m=height)
+        wall = wall_beside(world.site, world.walls, body.position_m, limits.half_height_m)
         air = world.air
-        above = jnp.maximum(body.position_m[2] - ground.point_m[2], 0.0)
+        above = jnp.maximum(body.position_m[2] - sample(world.site.terrain_m, world.site, body.position_m[:2]), 0.0)
         steady = steady_wind(air.speed_m_s, air.from_rad, above)
         through = body.velocity_m_s - steady
         airspeed = jnp.sqrt(jnp.sum(through * through) + 1e-12)
@@ -71,17 +73,17 @@ def _refreshed(
             dt=world.timing.judge_period_s,
         )  # fmt: skip
         wind = steady + air.gusts * gust_velocity(gust, air.speed_m_s, air.from_rad, above)
-        return replace(around, ground=ground, height_m=height, gust=gust, wind_m_s=wind)
+        return replace(around, ground=ground, wall=wall, height_m=height, gust=gust, wind_m_s=wind)
 
-    def one(noise: jax.Array | None, params: Any, vehicle: Any, around: Surroundings) -> Surroundings:
-        return jax.lax.cond(running, anew, lambda *given: given[-1], noise, params, vehicle, around)
+    def one(noise: jax.Array | None, params: Any, limits: Limits, vehicle: Any, around: Surroundings) -> Surroundings:
+        return jax.lax.cond(running, anew, lambda *given: given[-1], noise, params, limits, vehicle, around)
 
     def draw() -> jax.Array:
         return jax.vmap(gust_noise)(randomness.per_vehicle(gusts, number, group.member))
 
     noise = jax.lax.cond(running, draw, lambda: jnp.zeros((group.size, GUST_NOISE))) if kind.FLIES else None
     every = over_vehicles(one, layout=world.layout, unroll=1)
-    refreshed: Surroundings = every(noise, group.params, state.vehicle, state.around)
+    refreshed: Surroundings = every(noise, group.params, group.limits, state.vehicle, state.around)
     return refreshed
 
 

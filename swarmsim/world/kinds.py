@@ -31,7 +31,7 @@ class Kind(Protocol):
 
     def tick(
         self, params: Any, vehicle: Any, control: Any, command: Any, armed: jax.Array, ground: Plane,
-        wind_m_s: jax.Array, site: Site, *, engine: str, dt: float, substeps: int, layout: Layout,
+        wall: Plane, wind_m_s: jax.Array, site: Site, *, engine: str, dt: float, substeps: int, layout: Layout,
     ) -> tuple[Any, Any, jax.Array]:  # fmt: skip
         """Vehicle, controller and impact speed [] after one control period; ``layout`` is how it is mapped."""
 
@@ -41,7 +41,9 @@ class Kind(Protocol):
     def crashed(self, params: Any, vehicle: Any, height_m: jax.Array, impact_m_s: jax.Array, limits: Limits) -> Any:
         """Whether [] it tipped over or hit the ground too hard."""
 
-    def obstructed(self, params: Any, vehicle: Any, impact_m_s: jax.Array, limits: Limits, site: Site) -> jax.Array:
+    def obstructed(
+        self, params: Any, vehicle: Any, wall: Plane, impact_m_s: jax.Array, limits: Limits, site: Site
+    ) -> jax.Array:
         """Whether [] it hit an obstacle."""
 
 

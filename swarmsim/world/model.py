@@ -13,6 +13,7 @@ from swarmsim.radiation.detector import Source
 from swarmsim.scalars import Layout
 from swarmsim.sensors.radiation import Counter
 from swarmsim.site import Site
+from swarmsim.site.walls import Walls
 
 
 @pytree
@@ -101,6 +102,7 @@ class World:
     """The truth: a site with its sources and air, and the team."""
 
     site: Site
+    walls: Walls  # of the site, for what flies
     sources: Source  # leading axis S >= 1; a source of no activity stands in for none
     air: Air
     traffic: TrafficRules

@@ -13,6 +13,7 @@ from swarmsim.physics.multirotor import make_multirotor_step, rest_state
 from swarmsim.physics.rotations import yaw_of
 from swarmsim.scalars import Layout
 from swarmsim.site import Site, sample, sample_with_gradient
+from swarmsim.site.walls import LOWEST_M, Walls, wall_near
 from swarmsim.vehicles.multirotor import MultirotorParams
 from swarmsim.vehicles.state import MultirotorState
 from swarmsim.world.model import Limits
@@ -20,16 +21,33 @@ from swarmsim.world.model import Limits
 FLIES = True
 TILT_LIMIT_COSINE = 0.3  # about 72 degrees: beyond it near the ground a multirotor has tipped over
 TIP_HEIGHT_M = 1.0
-OBSTACLE_HEIGHT_M = 0.4  # a surface this far above the terrain is an obstacle, not ground
+ROOF_SLOPE_MAX = 1.0
+ROOF_DEPTH_M = 0.3  # what is no further below a roof's surface than this has landed on it and has not run into it
 
 Command = MultirotorCommand | PositionCommand
 
 
 def ground_below(site: Site, position_m: jax.Array) -> Plane:
-    """Tangent plane of the terrain below a position [3]."""
-    height, slope = sample_with_gradient(site.terrain_m, site, position_m[:2])
+    """Tangent plane of what is below a position [3]: the terrain, or a roof that it is over.
+
+    A surface steeper than `ROOF_SLOPE_MAX` is the edge of something, where the terrain below is what one falls to.
+    """
+    xy = position_m[:2]
+    terrain, slope = sample_with_gradient(site.terrain_m, site, xy)
+    roof, pitch = sample_with_gradient(site.surface_m, site, xy)
+    over = (roof - terrain > LOWEST_M) & (position_m[2] > roof - ROOF_DEPTH_M)
+    over &= jnp.sum(pitch * pitch) < ROOF_SLOPE_MAX**2
+    height, slope = jnp.where(over, roof, terrain), jnp.where(over, pitch, slope)
     normal = jnp.append(-slope, 1.0)
-    return Plane(point_m=jnp.append(position_m[:2], height), normal=normal * jax.lax.rsqrt(jnp.sum(normal * normal)))
+    return Plane(point_m=jnp.append(xy, height), normal=normal * jax.lax.rsqrt(jnp.sum(normal * normal)))
+
+
+def wall_beside(site: Site, walls: Walls, position_m: jax.Array, half_height_m: jax.Array) -> Plane:
+    """Upright plane of the nearest wall at the height of a vehicle's lower end."""
+    xy = position_m[:2]
+    low = position_m[2] - half_height_m + ROOF_DEPTH_M - sample(site.terrain_m, site, xy)
+    distance, normal = wall_near(walls, site, xy, low)
+    return Plane(point_m=position_m - jnp.append(distance * normal, 0.0), normal=jnp.append(normal, 0.0))
 
 
 def rest(params: MultirotorParams, site: Site, start_m: jax.Array, yaw_rad: jax.Array) -> MultirotorState:
@@ -66,6 +84,7 @@ def tick(
     command: Command,
     armed: jax.Array,
     ground: Plane,
+    wall: Plane,
     wind_m_s: jax.Array,
     site: Site,
     *,
@@ -81,7 +100,7 @@ def tick(
     velocity = vehicle.body.velocity_m_s
 
     def one(vehicle: MultirotorState, _: None) -> tuple[MultirotorState, None]:
-        return step(params, vehicle, speeds, wind_m_s, ground), None
+        return step(params, vehicle, speeds, wind_m_s, ground, wall), None
 
     vehicle, _ = jax.lax.scan(one, vehicle, None, length=substeps)
     before = jnp.sqrt(jnp.sum(velocity * velocity) + 1e-12)
@@ -104,12 +123,7 @@ def crashed(
 
 
 def obstructed(
-    params: MultirotorParams, vehicle: MultirotorState, impact_m_s: jax.Array, limits: Limits, site: Site
+    params: MultirotorParams, vehicle: MultirotorState, wall: Plane, impact_m_s: jax.Array, limits: Limits, site: Site
 ) -> jax.Array:
-    """Whether [] the cylinder around it reaches into something that stands on the terrain."""
-    position = vehicle.body.position_m
-    ring = limits.radius_m * jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    around = position[:2] + ring
-    surface = sample(site.surface_m, site, around)
-    stands = surface - sample(site.terrain_m, site, around) > OBSTACLE_HEIGHT_M
-    return jnp.any(stands & (position[2] - limits.half_height_m < surface))
+    """Whether [] its rotors touch a wall."""
+    return jnp.sum((vehicle.body.position_m - wall.point_m) * wall.normal) < limits.radius_m

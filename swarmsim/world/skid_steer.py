@@ -47,6 +47,7 @@ def tick(
     command: SkidSteerCommand,
     armed: jax.Array,
     ground: Plane,
+    wall: Plane,
     wind_m_s: jax.Array,
     site: Site,
     *,
@@ -86,7 +87,7 @@ def crashed(
 
 
 def obstructed(
-    params: SkidSteerParams, vehicle: SkidSteerState, impact_m_s: jax.Array, limits: Limits, site: Site
+    params: SkidSteerParams, vehicle: SkidSteerState, wall: Plane, impact_m_s: jax.Array, limits: Limits, site: Site
 ) -> jax.Array:
     """Whether [] it hit a wall faster than its bumpers take."""
     return impact_m_s > limits.impact_speed_m_s

@@ -24,7 +24,8 @@ class Clock:
 class Surroundings:
     """What is around a vehicle, refreshed once in a judging period."""
 
-    ground: Plane  # tangent plane of the terrain below it
+    ground: Plane  # tangent plane of what is below it: terrain, or a roof that it is over
+    wall: Plane  # upright plane of the nearest wall at its height; far away where there is none
     wind_m_s: jax.Array  # [U, 3] velocity of the air, world
     gust: GustState
     height_m: jax.Array  # [U] of the lowest contact point above the ground

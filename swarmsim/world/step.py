@@ -21,7 +21,7 @@ from swarmsim.world.counting import counted, not_seen, noted
 from swarmsim.world.judge import look_around, record_events
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
-from swarmsim.world.multirotor import ground_below
+from swarmsim.world.multirotor import ground_below, wall_beside
 from swarmsim.world.radio import radio_start
 from swarmsim.world.state import Clock, GroupState, Readings, Surroundings, WorldState, now_s
 
@@ -47,6 +47,7 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
     gust_keys = randomness.per_vehicle(randomness.consumer(key, "gust start"), jnp.int32(0), group.member)
     around = Surroundings(
         ground=jax.vmap(ground_below, in_axes=(None, 0))(world.site, position),
+        wall=jax.vmap(partial(wall_beside, world.site, world.walls))(position, group.limits.half_height_m),
         wind_m_s=jnp.zeros((size, 3)),
         gust=jax.vmap(gust_start)(gust_keys),
         height_m=jnp.zeros(size),
@@ -159,7 +160,8 @@ def move(world: World, kind: str, params: Any, state: GroupState, command: Any) 
     timing = world.timing
     armed = state.active & events.able(state.event_time_s)
     vehicle, control, impact = KINDS[kind].tick(
-        params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wind_m_s, world.site,
+        params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wall,
+        state.around.wind_m_s, world.site,
         engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps, layout=world.layout,
     )  # fmt: skip
     total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))
