@@ -216,7 +216,8 @@ def _acceleration(
     wanted = _limited(feedback, jnp.stack([reach, reach])) - memory.disturbance_m_s2
     lift = jnp.maximum(wanted[2], (LIFT_MIN - 1.0) * GRAVITY_M_S2)
     level = _limited(wanted, jnp.stack([autopilot.tilt_max_tan * (GRAVITY_M_S2 + lift), reach]))
-    still = touching & (jnp.sum(body.velocity_m_s * body.velocity_m_s) < LANDED_SPEED_M_S**2)
+    moves = body.velocity_m_s - fed * jnp.array([1.0, 1.0, 0.0])  # over what it is to land on
+    still = touching & (jnp.sum(moves * moves) < LANDED_SPEED_M_S**2)
     given = jnp.stack([level[0], level[1], lift])
     return given, _stuck(memory.stuck_s, velocity[2], still, dt)
 

@@ -19,6 +19,7 @@ class Plane:
 
     point_m: jax.Array  # [3] m, world: any point of it
     normal: jax.Array  # [3] unit vector, world, out of the ground or the wall
+    velocity_m_s: jax.Array | None = None  # [3] world, of a rover's deck; None: stands still
 
 
 @pytree

@@ -136,7 +136,7 @@ def step_loads(
         slip_m=state.contact_slip_m,
         height_m=contact_height,
         normal=normal,
-        velocity_m_s=velocity,
+        velocity_m_s=velocity if ground.velocity_m_s is None else velocity - to_body(attitude, ground.velocity_m_s),
         angular_velocity_rad_s=body.angular_velocity_rad_s,
         dt=dt,
     )

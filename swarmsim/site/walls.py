@@ -64,7 +64,7 @@ def wall_near(walls: Walls, site: Site, xy: jax.Array, height_m: jax.Array) -> t
     lower = jnp.clip(jnp.clip(level, 0.0, levels - 1.0).astype(jnp.int32), 0, levels - 1)
     x, y = jnp.clip(place[0] - column, 0.0, 1.0), jnp.clip(place[1] - row, 0.0, 1.0)
     up = jnp.clip(level - lower, 0.0, 1.0)
-    flat = walls.distance_m.reshape(-1)
+    flat = jnp.asarray(walls.distance_m).reshape(-1)
 
     def at(number: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Distance and slopes [] of a level, per cell."""

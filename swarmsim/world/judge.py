@@ -11,11 +11,14 @@ from swarmsim.physics.wind import GUST_NOISE, gust_noise, gust_step, gust_veloci
 from swarmsim.scalars import over_vehicles
 from swarmsim.site import sample
 from swarmsim.world import events
+from swarmsim.world.collisions import Bodies, collide
+from swarmsim.world.decks import on_decks
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below, wall_beside
+from swarmsim.world.neighbours import DENSE_MAX, WINDOW, candidates, cleared, norm
 from swarmsim.world.radio import broadcast
-from swarmsim.world.right_of_way import kept_aside, right_of_way
+from swarmsim.world.right_of_way import kept_aside, reach_of, right_of_way
 from swarmsim.world.state import GroupState, Surroundings, WorldState
 
 
@@ -30,7 +33,7 @@ def look_around(world: World, state: WorldState, number: jax.Array) -> tuple[Wor
         for running, group, g in zip(state.clock.running, world.groups, state.groups, strict=True)
     ]
     groups = tuple(replace(g, around=new) for g, new in zip(state.groups, around, strict=True))
-    groups, collided, crowded = _in_traffic(world, groups)
+    groups, collided, crowded = _in_traffic(world, on_decks(world, groups))
     state = replace(state, groups=groups, crowded=state.crowded | crowded)
     return replace(state, radio=broadcast(world, state, number)), collided
 
@@ -90,32 +93,56 @@ def _refreshed(
 def _in_traffic(
     world: World, groups: tuple[GroupState, ...]
 ) -> tuple[tuple[GroupState, ...], list[jax.Array], jax.Array]:
-    """Groups with what the other vehicles ask of each, which vehicles have collided [U], and the search's overflow."""
-    flies = [jnp.full(group.size, KINDS[group.kind].FLIES) for group in world.groups]
-    able = [g.active & events.able(g.event_time_s) for g in groups]
-    height, every = jnp.concatenate([g.around.height_m for g in groups]), jnp.concatenate(flies)
+    """Groups after collisions, with what others ask of each; who has collided [U]; whether the search overflowed."""
+    flies = jnp.concatenate([jnp.full(group.size, KINDS[group.kind].FLIES) for group in world.groups])
+    active = jnp.concatenate([g.active for g in groups])
+    able = active & jnp.concatenate([events.able(g.event_time_s) for g in groups])
+    height = jnp.concatenate([g.around.height_m for g in groups])
+    position = jnp.concatenate([g.vehicle.body.position_m for g in groups])
+    velocity = jnp.concatenate([g.vehicle.body.velocity_m_s for g in groups])
+    radius = jnp.concatenate([group.limits.radius_m for group in world.groups])
+    half_height = jnp.concatenate([group.limits.half_height_m for group in world.groups])
+    rules, dt = world.traffic, world.timing.judge_period_s
+    place, usable = cleared(jnp.where(jnp.isfinite(velocity), position, jnp.inf))
+    pace = jnp.where(usable[:, None], velocity, 0.0)
+    reach = reach_of(usable, radius, jnp.where(flies, rules.separation_m, rules.ground_separation_m))
+    near = candidates(place, usable, usable, reach + 2.0 * dt * jnp.max(norm(pace)), WINDOW, DENSE_MAX)
     traffic = right_of_way(
-        jnp.concatenate([g.vehicle.body.position_m for g in groups]),
-        jnp.concatenate([g.vehicle.body.velocity_m_s for g in groups]),
+        position,
+        velocity,
         height_m=height,
-        flies=every,
-        active=jnp.concatenate(able),
+        flies=flies,
+        active=able,
         rank=jnp.concatenate([group.member for group in world.groups]),
-        radius_m=jnp.concatenate([group.limits.radius_m for group in world.groups]),
-        half_height_m=jnp.concatenate([group.limits.half_height_m for group in world.groups]),
-        separation_m=world.traffic.separation_m,
-        ground_separation_m=world.traffic.ground_separation_m,
+        radius_m=radius,
+        half_height_m=half_height,
+        separation_m=rules.separation_m,
+        ground_separation_m=rules.ground_separation_m,
         held=jnp.concatenate([g.around.hold for g in groups]),
+        near=near,
     )
+    mass = jnp.concatenate([group.params.mass_kg for group in world.groups])
+    bodies = Bodies(
+        position_m=place,
+        velocity_m_s=pace,
+        radius_m=radius,
+        half_height_m=half_height,
+        mass_kg=jnp.where(active, mass, jnp.inf),
+        flies=flies,
+        active=active,
+    )
+    met = collide(bodies, near, dt)
     before = jnp.concatenate([g.around.push_m for g in groups])
-    separation, dt = world.traffic.separation_m, world.timing.judge_period_s
-    push, aside = kept_aside(before, traffic.push_m, height, every, separation, dt)
+    push, aside = kept_aside(before, traffic.push_m, height, flies, rules.separation_m, dt)
     hold = traffic.hold | aside
     told, collided, first = [], [], 0
     for group, g in zip(world.groups, groups, strict=True):
         part = slice(first, first + group.size)
         around = replace(g.around, hold=hold[part], push_m=push[part], nearest_m=traffic.nearest_m[part])
-        told.append(replace(g, around=around))
-        collided.append(traffic.collided[part])
+        knocked = jax.vmap(KINDS[group.kind].knocked)(
+            group.params, g.vehicle, met.velocity_m_s[part], met.spin_nms[part]
+        )
+        told.append(replace(g, around=around, vehicle=knocked))
+        collided.append(met.hit[part] & active[part])
         first += group.size
     return tuple(told), collided, traffic.overflow

@@ -35,6 +35,9 @@ class Kind(Protocol):
     ) -> tuple[Any, Any, jax.Array]:  # fmt: skip
         """Vehicle, controller and impact speed [] after one control period; ``layout`` is how it is mapped."""
 
+    def knocked(self, params: Any, vehicle: Any, velocity_m_s: jax.Array, spin_nms: jax.Array) -> Any:
+        """The vehicle after a change of its velocity [3] and an angular impulse [3] N m s, both world."""
+
     def height(self, params: Any, vehicle: Any, ground: Plane) -> jax.Array:
         """Height [] of the lowest contact point above the ground."""
 

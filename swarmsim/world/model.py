@@ -75,6 +75,7 @@ class Limits:
 
     radius_m: jax.Array  # [U] of the upright cylinder around it
     half_height_m: jax.Array  # [U] of that cylinder, the origin in its middle
+    deck_m: jax.Array  # [U, 3] half length, half width and height over the origin of a rover's upper side; else zero
     impact_speed_m_s: jax.Array  # [U] largest speed at which it may meet the ground or a wall
     battery_j: jax.Array  # [U] capacity
 

@@ -1,5 +1,6 @@
 """The kind ``multirotor``: how one is controlled, flown and judged (see `swarmsim.world.kinds.Kind`)."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ from swarmsim.control.multirotor import ControlMemory, control
 from swarmsim.control.multirotor import control_start as controller
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.multirotor import make_multirotor_step, rest_state
-from swarmsim.physics.rotations import yaw_of
+from swarmsim.physics.rotations import rotation_matrix, to_body, yaw_of
 from swarmsim.scalars import Layout
 from swarmsim.site import Site, sample, sample_with_gradient
 from swarmsim.site.walls import LOWEST_M, Walls, wall_near
@@ -39,7 +40,8 @@ def ground_below(site: Site, position_m: jax.Array) -> Plane:
     over &= jnp.sum(pitch * pitch) < ROOF_SLOPE_MAX**2
     height, slope = jnp.where(over, roof, terrain), jnp.where(over, pitch, slope)
     normal = jnp.append(-slope, 1.0)
-    return Plane(point_m=jnp.append(xy, height), normal=normal * jax.lax.rsqrt(jnp.sum(normal * normal)))
+    unit = normal * jax.lax.rsqrt(jnp.sum(normal * normal))
+    return Plane(point_m=jnp.append(xy, height), normal=unit, velocity_m_s=jnp.zeros(3))
 
 
 def wall_beside(site: Site, walls: Walls, position_m: jax.Array, half_height_m: jax.Array) -> Plane:
@@ -77,6 +79,15 @@ def stay(params: MultirotorParams, vehicle: MultirotorState) -> PositionCommand:
     )
 
 
+def knocked(params: MultirotorParams, vehicle: MultirotorState, velocity_m_s: jax.Array, spin_nms: jax.Array) -> Any:
+    """The vehicle after a change of its velocity [3] and an angular impulse [3] N m s, both world."""
+    body = vehicle.body
+    turn = to_body(rotation_matrix(body.quaternion), spin_nms) / params.inertia_kg_m2
+    rate = body.angular_velocity_rad_s + turn
+    body = replace(body, velocity_m_s=body.velocity_m_s + velocity_m_s, angular_velocity_rad_s=rate)
+    return replace(vehicle, body=body)
+
+
 def tick(
     params: MultirotorParams,
     vehicle: MultirotorState,
@@ -103,7 +114,8 @@ def tick(
         return step(params, vehicle, speeds, wind_m_s, ground, wall), None
 
     vehicle, _ = jax.lax.scan(one, vehicle, None, length=substeps)
-    before = jnp.sqrt(jnp.sum(velocity * velocity) + 1e-12)
+    relative = velocity if ground.velocity_m_s is None else velocity - ground.velocity_m_s
+    before = jnp.sqrt(jnp.sum(relative * relative) + 1e-12)
     return vehicle, memory, jnp.where(vehicle.ground_force_n > 0.0, before, 0.0)
 
 

@@ -61,6 +61,7 @@ def right_of_way(
     separation_m: jax.Array,
     ground_separation_m: jax.Array,
     held: jax.Array | None = None,
+    near: Candidates | None = None,
     window: int = WINDOW,
     dense_max: int = DENSE_MAX,
 ) -> Traffic:
@@ -98,6 +99,7 @@ def right_of_way(
         ground_separation_m: [] m, between rovers, 3-D.
         held: [V] bool, which were told to wait before: they set out only where the look-ahead leaves `RELEASE` times
             the separation, or they would set out into the way of what is about to pass. None: nobody.
+        near: pairs with all that are within `reach_of`; they are searched for if not given.
         window, dense_max: see `neighbours`.
 
     Returns:
@@ -123,9 +125,9 @@ def right_of_way(
         radius_m=radius_m,
         half_height_m=half_height_m,
     )
-    widest = jnp.max(jnp.where(usable, radius_m, 0.0), initial=0.0)
-    reach = jnp.maximum(jnp.max(fleet.gap_m, initial=0.0), 2.0 * widest)
-    near = candidates(place, usable, usable, reach, window, dense_max)
+    reach = reach_of(usable, radius_m, fleet.gap_m)
+    if near is None:
+        near = candidates(place, usable, usable, reach, window, dense_max)
     dense = near.index is None
     index, valid = _yields(fleet, near, close=True, coming=dense)
     overflow = near.overflow
@@ -145,6 +147,12 @@ def right_of_way(
         nearest_m=nearest,
         overflow=overflow,
     )
+
+
+def reach_of(usable: jax.Array, radius_m: jax.Array, gap_m: jax.Array) -> jax.Array:
+    """Distance [] m within which vehicles [V] may touch, or be closer than their separation ``gap_m`` [V]."""
+    widest = jnp.max(jnp.where(usable, radius_m, 0.0), initial=0.0)
+    return jnp.maximum(jnp.max(gap_m, initial=0.0), 2.0 * widest)
 
 
 def kept_aside(

@@ -1,5 +1,6 @@
 """The kind ``skid_steer``: how a rover is controlled, driven and judged (see `swarmsim.world.kinds.Kind`)."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 from swarmsim.control.commands import DRIVE, DRIVE_TO, DriveCommand, SkidSteerCommand, skid_steer_command
 from swarmsim.control.skid_steer import pursue, wheel_speeds
 from swarmsim.physics.contact import Plane
+from swarmsim.physics.rotations import rotation_matrix
 from swarmsim.physics.skid_steer import make_skid_steer_step, rest_state
 from swarmsim.physics.wheels import impact_speed
 from swarmsim.scalars import Layout
@@ -71,6 +73,16 @@ def tick(
 
     vehicle, _ = jax.lax.scan(one, vehicle, None, length=substeps)
     return vehicle, memory, hit
+
+
+def knocked(params: SkidSteerParams, vehicle: SkidSteerState, velocity_m_s: jax.Array, spin_nms: jax.Array) -> Any:
+    """The rover after a change of its velocity [3] and an angular impulse [3] N m s (world); it stays on the ground."""
+    body, level = vehicle.body, jnp.array([1.0, 1.0, 0.0])
+    up = rotation_matrix(body.quaternion)[2]
+    turn = spin_nms[2] / params.inertia_kg_m2[2, 2] * up
+    rate = body.angular_velocity_rad_s + turn
+    body = replace(body, velocity_m_s=body.velocity_m_s + level * velocity_m_s, angular_velocity_rad_s=rate)
+    return replace(vehicle, body=body)
 
 
 def height(params: SkidSteerParams, vehicle: SkidSteerState, ground: Plane) -> jax.Array:

@@ -1,0 +1,141 @@
+"""What vehicles do to each other when they meet: impulses between upright cylinders.
+
+A pair is looked at once in a judging period, and its way to the next look is swept, so that fast vehicles do not pass
+through each other between two looks. Both partners compute the same impulse with opposite signs: momentum is conserved.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.pytree import pytree
+from swarmsim.world.neighbours import Candidates, norm, root
+
+RESTITUTION = 0.2
+"""Speed of parting over that of approach: an estimate for light frames, propellers and bumpers that give way."""
+FRICTION = 0.3
+"""Coulomb coefficient between vehicles: an estimate for plastic, carbon fibre and aluminium."""
+PART_1_S = 4.0
+"""Rate at which vehicles that overlap are moved apart; at most by `PART_MAX_M_S`."""
+PART_MAX_M_S = 1.0
+TOUCH_M = 0.02
+"""Cylinders closer than this touch."""
+
+
+@pytree
+class Bodies:
+    """Vehicles as upright cylinders; axis V."""
+
+    position_m: jax.Array  # [V, 3] world, middle of the cylinder
+    velocity_m_s: jax.Array  # [V, 3] world
+    radius_m: jax.Array  # [V]
+    half_height_m: jax.Array  # [V]
+    mass_kg: jax.Array  # [V] inf: does not give way
+    flies: jax.Array  # [V] bool: a rover stands on the ground, which takes vertical impulses
+    active: jax.Array  # [V] bool: of two that are not, none moves
+
+
+@pytree
+class Collisions:
+    """What collisions did; axis V."""
+
+    velocity_m_s: jax.Array  # [V, 3] change of the velocity, world
+    spin_nms: jax.Array  # [V, 3] angular impulse about the centre of mass, world
+    hit: jax.Array  # [V] bool: has met another one
+
+
+def collide(bodies: Bodies, near: Candidates, dt: float) -> Collisions:
+    """Impulses of the pairs of ``near`` that touch now or will within ``dt`` s at their present velocities.
+
+    Newton's restitution along the normal, which is that of the faces that meet last (rim to rim, or top to bottom), and
+    Coulomb friction across it. Where a vehicle meets several at once, each pair's impulse is shared by their number,
+    equal for both partners. A multirotor above a rover is left to its feet, which stand on the rover's deck.
+    """
+    of = near.of
+    apart = bodies.position_m[:, None] - of(bodies.position_m)
+    closing = bodies.velocity_m_s[:, None] - of(bodies.velocity_m_s)
+    reach = bodies.radius_m[:, None] + of(bodies.radius_m)
+    tall = bodies.half_height_m[:, None] + of(bodies.half_height_m)
+    rim_from, rim_to = _rims_overlap(apart, closing, reach)
+    top_from, top_to = _heights_overlap(apart, closing, tall)
+    begin, end = jnp.maximum(rim_from, top_from), jnp.minimum(rim_to, top_to)
+    meets = near.pair & (begin < end) & (begin < dt) & (end > 0.0)
+    at = jnp.clip(begin, 0.0, dt)[..., None] * closing + apart
+    inside = begin <= 0.0
+    level = norm(at[..., :2])
+    beside = reach - level < tall - jnp.abs(at[..., 2])  # of two that overlap already: the shorter way out
+    upright = jnp.where(inside, ~beside, top_from > rim_from)
+    normal = _normal(at, level, upright)
+    both_fly = bodies.flies[:, None] & of(bodies.flies)
+    meets &= ~(upright & ~both_fly) & (bodies.active[:, None] | of(bodies.active))
+    depth = jnp.where(inside, jnp.where(upright, tall - jnp.abs(at[..., 2]), reach - level), 0.0)
+    impulse = _impulses(bodies, near, meets, closing, normal, jnp.maximum(depth - TOUCH_M, 0.0))
+    touched = meets & (jnp.sum(impulse * impulse, axis=-1) > 0.0)
+    number = jnp.sum(touched, axis=1).astype(jnp.float32)
+    impulse = impulse / jnp.maximum(jnp.maximum(number[:, None], of(number)), 1.0)[..., None]
+    arm = _arm(bodies, near, at, normal, upright)
+    return Collisions(
+        velocity_m_s=jnp.sum(impulse, axis=1) / bodies.mass_kg[:, None],
+        spin_nms=jnp.sum(jnp.cross(arm, impulse), axis=1),
+        hit=jnp.any(meets, axis=1),
+    )
+
+
+def _rims_overlap(apart: jax.Array, closing: jax.Array, reach: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """From when to when [V, C] s the horizontal distance is below ``reach`` [V, C], at constant velocities."""
+    a = jnp.sum(closing[..., :2] ** 2, axis=-1)
+    b = jnp.sum(apart[..., :2] * closing[..., :2], axis=-1)
+    c = jnp.sum(apart[..., :2] ** 2, axis=-1) - reach * reach
+    discriminant = b * b - a * c
+    spread = root(discriminant)
+    still = a < 1e-8
+    speed = jnp.where(still, 1.0, a)
+    never = jnp.where(still, c >= 0.0, discriminant <= 0.0)
+    first = jnp.where(still, -jnp.inf, (-b - spread) / speed)
+    last = jnp.where(still, jnp.inf, (-b + spread) / speed)
+    return jnp.where(never, jnp.inf, first), jnp.where(never, -jnp.inf, last)
+
+
+def _heights_overlap(apart: jax.Array, closing: jax.Array, tall: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """From when to when [V, C] s the difference in height is below ``tall`` [V, C]."""
+    gap, rate = apart[..., 2], closing[..., 2]
+    still = jnp.abs(rate) < 1e-4
+    speed = jnp.where(still, 1.0, rate)
+    one, other = (-tall - gap) / speed, (tall - gap) / speed
+    within = jnp.abs(gap) < tall
+    first = jnp.where(still, jnp.where(within, -jnp.inf, jnp.inf), jnp.minimum(one, other))
+    last = jnp.where(still, jnp.where(within, jnp.inf, -jnp.inf), jnp.maximum(one, other))
+    return first, last
+
+
+def _normal(at: jax.Array, level: jax.Array, upright: jax.Array) -> jax.Array:
+    """Unit vector [V, C, 3] from the other one; exactly opposite for the two of a pair."""
+    side = at[..., :2] / jnp.maximum(level, 1e-6)[..., None]
+    flat = jnp.concatenate([side, jnp.zeros_like(level)[..., None]], axis=-1)
+    up = jnp.stack([jnp.zeros_like(level), jnp.zeros_like(level), jnp.sign(at[..., 2])], axis=-1)
+    return jnp.where(upright[..., None], up, flat)
+
+
+def _impulses(
+    bodies: Bodies, near: Candidates, meets: jax.Array, closing: jax.Array, normal: jax.Array, depth: jax.Array
+) -> jax.Array:
+    """Impulse [V, C, 3] N s on each from each that it meets."""
+    inverse = 1.0 / bodies.mass_kg
+    effective = 1.0 / jnp.maximum(inverse[:, None] + near.of(inverse), 1e-9)
+    along = jnp.sum(closing * normal, axis=-1)
+    wanted = jnp.minimum(PART_1_S * depth, PART_MAX_M_S)
+    parting = wanted - jnp.where(along < 0.0, 1.0 + RESTITUTION, 1.0) * along
+    push = jnp.where(meets, effective * jnp.maximum(parting, 0.0), 0.0)
+    across = closing - along[..., None] * normal
+    slip = norm(across)
+    rub = jnp.minimum(FRICTION * push, effective * slip) / jnp.maximum(slip, 1e-6)
+    return push[..., None] * normal - rub[..., None] * across
+
+
+def _arm(bodies: Bodies, near: Candidates, at: jax.Array, normal: jax.Array, upright: jax.Array) -> jax.Array:
+    """Place [V, C, 3] m where they touch, from the own centre: on the rim, in the middle of the heights they share."""
+    half, other = bodies.half_height_m[:, None], near.of(bodies.half_height_m)
+    middle = -at[..., 2]  # height of the other's centre over the own one
+    top, bottom = jnp.minimum(half, middle + other), jnp.maximum(-half, middle - other)
+    rim = -bodies.radius_m[:, None, None] * normal + 0.5 * (top + bottom)[..., None] * jnp.array([0.0, 0.0, 1.0])
+    face = -0.5 * at * jnp.array([1.0, 1.0, 0.0]) - half[..., None] * normal
+    return jnp.where(upright[..., None], face, rim)

@@ -1,0 +1,58 @@
+"""Rovers as ground: a multirotor above a rover's deck stands on it, and rides along."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.physics.contact import Plane
+from swarmsim.physics.rotations import rotation_matrix
+from swarmsim.world.kinds import KINDS
+from swarmsim.world.model import Group, World
+from swarmsim.world.state import GroupState
+
+BELOW_M = 0.15
+"""Feet that are no further below a deck than this stand on it; a lower vehicle is beside the rover."""
+
+
+def on_decks(world: World, groups: tuple[GroupState, ...]) -> tuple[GroupState, ...]:
+    """The groups with the deck of a rover as ground of the multirotors that are over it."""
+    rovers = [(group, g) for group, g in zip(world.groups, groups, strict=True) if not KINDS[group.kind].FLIES]
+    if not rovers:
+        return groups
+    pose = [jnp.concatenate(x) for x in zip(*(_decks(group, g) for group, g in rovers), strict=True)]
+    return tuple(
+        _over(group, g, *pose) if KINDS[group.kind].FLIES else g for group, g in zip(world.groups, groups, strict=True)
+    )
+
+
+def _decks(group: Group, g: GroupState) -> tuple[jax.Array, ...]:
+    """Middle [U, 3], attitude [U, 3, 3], velocity [U, 3] and half length and width [U, 2] of rovers' decks."""
+    body, deck = g.vehicle.body, group.limits.deck_m
+    attitude = jax.vmap(rotation_matrix)(body.quaternion)
+    lift = attitude[:, :, 2] * deck[:, 2:]
+    rate = jnp.sum(attitude * body.angular_velocity_rad_s[:, None, :], axis=-1)
+    return body.position_m + lift, attitude, body.velocity_m_s + jnp.cross(rate, lift), deck[:, :2]
+
+
+def _over(
+    group: Group, g: GroupState, middle: jax.Array, attitude: jax.Array, velocity: jax.Array, half: jax.Array
+) -> GroupState:
+    """Multirotors with the highest deck below them as their ground."""
+    kind = KINDS[group.kind]
+    offset = g.vehicle.body.position_m[:, None] - middle
+    within = jnp.all(jnp.abs(jnp.sum(offset[..., None] * attitude[None, :, :, :2], axis=-2)) < half, axis=-1)
+    planes = Plane(point_m=middle, normal=attitude[:, :, 2], velocity_m_s=velocity)
+    one = jax.vmap(kind.height, in_axes=(None, None, 0))
+    height = jax.vmap(one, in_axes=(0, 0, None))(group.params, g.vehicle, planes)
+    held = jnp.where(within & (height > -BELOW_M), middle[:, 2], -jnp.inf)
+    best = jnp.argmax(held, axis=1)
+    over = jnp.isfinite(jnp.max(held, axis=1))
+    deck = jax.tree.map(lambda x: x[best], planes)
+
+    def chosen(new: jax.Array, old: jax.Array) -> jax.Array:
+        return jnp.where(over.reshape(over.shape + (1,) * (new.ndim - 1)), new, old)
+
+    ground = jax.tree.map(chosen, deck, g.around.ground)
+    feet = jnp.take_along_axis(height, best[:, None], axis=1)[:, 0]
+    return replace(g, around=replace(g.around, ground=ground, height_m=chosen(feet, g.around.height_m)))
