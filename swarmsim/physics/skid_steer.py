@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from swarmsim.physics import rotations, wheel_contact, wheels
 from swarmsim.physics.rotations import to_body, to_world
 from swarmsim.physics.skid_steer_analytic import analytic_step
+from swarmsim.physics.walls import near_walls, stopped_by
 from swarmsim.site import Site, sample_with_gradient
 from swarmsim.vehicles.skid_steer import SkidSteerParams, tyre_sinkage
 from swarmsim.vehicles.state import RigidState, SkidSteerState
@@ -63,15 +64,18 @@ def mjx_step(
     hub = body.position_m + to_world(rotation, params.wheel_position_m)
     height, normal = wheels.ground_planes(site, hub[:, :2])
     distance = (hub[:, 2] - height) * normal[:, 2] - params.wheel_radius_m
-    push, turn = wheels.bumper_wrench(params, state, rotation, site)
-    force = to_body(rotation, jnp.append(push, -params.mass_kg * params.gravity_m_s2))
+    force = -params.mass_kg * params.gravity_m_s2 * rotation[2]
     velocity = to_body(rotation, body.velocity_m_s)
     twist = jnp.concatenate([velocity, body.angular_velocity_rad_s, state.wheel_speed_rad_s])
     wheel_torque = torque + wheels.rolling_torque(params, state.wheel_speed_rad_s)
-    smooth = wheel_contact.smooth_force(params, twist, force, turn * rotation[2], wheel_torque)
+    smooth = wheel_contact.smooth_force(params, twist, force, jnp.zeros(3), wheel_torque)
     change = dt * wheel_contact.accelerations(params, twist, smooth, distance, to_body(rotation, normal))
     velocity = body.velocity_m_s + to_world(rotation, change[:3])
     spin = body.angular_velocity_rad_s + change[3:6]
+    yaw_rate = jnp.sum(rotation[2] * spin)
+    held, turn = stopped_by(near_walls(params, body, rotation, site), params, velocity[:2], yaw_rate, dt)
+    velocity = jnp.append(held, velocity[2])
+    spin = spin + (turn - yaw_rate) * rotation[2]
     wheel_speed = state.wheel_speed_rad_s + change[6:]
     turned = rotations.multiply(body.quaternion, rotations.from_rotation_vector(dt * spin))
     return SkidSteerState(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from swarmsim.physics import wheels
 from swarmsim.physics.rotations import rotation_matrix, to_body, to_world, yaw_of
+from swarmsim.physics.walls import near_walls, stopped_by
 from swarmsim.site import Site, sample
 from swarmsim.vehicles.skid_steer import (
     SkidSteerParams,
@@ -30,17 +31,19 @@ def analytic_step(
     body = state.body
     rotation = rotation_matrix(body.quaternion)
     torque = wheels.motor_torque(params, state, command_rad_s, dt)
-    push, turn = wheels.bumper_wrench(params, state, rotation, site)
-    pushed = to_body(rotation, jnp.append(push, -params.mass_kg * params.gravity_m_s2))
+    pushed = -params.mass_kg * params.gravity_m_s2 * rotation[2]
     load = jnp.maximum(-pushed[2], 0.0)
     speed, side, _ = to_body(rotation, body.velocity_m_s)
     speed, wheel_mean = _roll(dt, params, speed, state.wheel_speed_rad_s, torque, pushed[0], load)
     hold = dt * params.friction * load / params.mass_kg
     side = _coulomb(side + dt * pushed[1] / params.mass_kg, hold, tyre_creep(params))
-    wheel_half_difference, yaw_rate = _turn(dt, params, state.wheel_speed_rad_s, torque, turn, load)
+    wheel_half_difference, yaw_rate = _turn(dt, params, state.wheel_speed_rad_s, torque, load)
     velocity = to_world(rotation, jnp.stack([speed, side, jnp.zeros(())]))
+    walls = near_walls(params, body, rotation, site)
+    held, yaw_rate = stopped_by(walls, params, velocity[:2], yaw_rate, dt)
+    speed, side, _ = to_body(rotation, jnp.append(held, velocity[2]))
     yaw = yaw_of(body.quaternion) + dt * yaw_rate
-    position, quaternion = _stand(params, site, body.position_m[:2] + dt * velocity[:2], yaw)
+    position, quaternion = _stand(params, site, body.position_m[:2] + dt * held, yaw)
     turned = rotation_matrix(quaternion)
     wheel_speed = wheel_mean + wheel_half_difference * jnp.array([-1.0, 1.0, -1.0, 1.0])
     return SkidSteerState(
@@ -100,7 +103,7 @@ def _roll(
 
 
 def _turn(
-    dt: float, params: SkidSteerParams, wheel_speed: jax.Array, torque: jax.Array, moment: jax.Array, load: jax.Array
+    dt: float, params: SkidSteerParams, wheel_speed: jax.Array, torque: jax.Array, load: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Half the difference of right and left wheel speeds [] (rad/s) and yaw rate [] (rad/s) after the step."""
     side = jnp.array([-1.0, 1.0, -1.0, 1.0])
@@ -110,7 +113,7 @@ def _turn(
     rolling = (
         0.25 * load * params.rolling_resistance * jnp.sum(side * jnp.tanh(wheel_speed / wheels.ROLLING_ONSET_RAD_S))
     )
-    force = jnp.sum(side * torque) / radius + moment / lever - rolling
+    force = jnp.sum(side * torque) / radius - rolling
     free = 0.25 * jnp.sum(side * wheel_speed) * radius + dt * force / inertia
     base, track = wheel_spacing(params.wheel_position_m)
     # Slip of a tyre over the tread's speed while turning: half the diagonal times b / B, and the yaw rate.
