@@ -19,6 +19,7 @@ from swarmsim.vehicles.state import RigidState, SkidSteerState
 SWEEPS = 8
 PROBES = 2  # for the nearest point of a side
 NOT_NEAR_M = 1e3  # clearance of a side whose nearest point is one of its ends
+STEEPNESS_MIN = 0.3  # of the interpolated clearance, which is 1 but for the raster
 REACH_M_S = 0.5  # contacts that need more change of speed than this to be touched do not share the impulses
 RECOVERY = 0.2  # share of a penetration that one step takes back
 RECOVERY_MAX_M_S = 0.2
@@ -29,7 +30,7 @@ _NEXT = (1, 3, 0, 2)  # corner that follows each of front left, front right, rea
 class Walls:
     """Points of the outline that can touch a wall: the four corners and the nearest point of each of the four sides."""
 
-    clearance_m: jax.Array  # [8] < 0 in the wall
+    clearance_m: jax.Array  # [8] distance to the wall along its normal, < 0 in the wall
     outward: jax.Array  # [8, 2] unit, world: out of the wall
     arm_m: jax.Array  # [8, 2] world, from the centre of mass
 
@@ -58,8 +59,9 @@ def near_walls(params: SkidSteerParams, body: RigidState, rotation: jax.Array, s
         value = jnp.where(falls, between, value[0]), jnp.where(falls, value[1], between)
         slope = jnp.where(falls, along, slope[0]), jnp.where(falls, slope[1], along)
     normal = jnp.concatenate([gradient, jnp.stack([side[:, 1], -side[:, 0]], axis=-1)])
+    steepness = jnp.maximum(jnp.sqrt(jnp.sum(gradient * gradient, axis=-1) + 1e-12), STEEPNESS_MIN)
     return Walls(
-        clearance_m=jnp.concatenate([clearance, jnp.where(within, between, NOT_NEAR_M)]),
+        clearance_m=jnp.concatenate([clearance / steepness, jnp.where(within, between, NOT_NEAR_M)]),
         outward=normal * jax.lax.rsqrt(jnp.sum(normal * normal, axis=-1, keepdims=True) + 1e-12),
         arm_m=jnp.concatenate([corner, arm]),
     )
