@@ -1,9 +1,8 @@
-"""Loads of a skid-steer rover other than tyre contact: motors, rolling resistance; ground planes; battery."""
+"""Loads of a skid-steer rover other than tyre contact: motors, rolling resistance; attitude on a slope; battery."""
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.site import Site, sample_with_gradient
 from swarmsim.vehicles.skid_steer import SkidSteerParams
 from swarmsim.vehicles.state import SkidSteerState
 
@@ -29,13 +28,6 @@ def energy_used(params: SkidSteerParams, state: SkidSteerState, torque_nm: jax.A
     """Energy [] (J) drawn since the start: |torque x speed| through the drive's efficiency, and the avionics."""
     shaft = jnp.sum(jnp.abs(torque_nm * state.wheel_speed_rad_s))
     return state.energy_j + dt * (shaft / params.drive_efficiency + params.avionics_power_w)
-
-
-def ground_planes(site: Site, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Tangent planes of the terrain at ``xy`` [n, 2] (m, world): heights [n] (m) and unit normals [n, 3], world."""
-    height, slope = sample_with_gradient(site.terrain_m, site, xy)
-    up = jax.lax.rsqrt(1.0 + jnp.sum(slope * slope, axis=-1, keepdims=True))
-    return height, jnp.concatenate([-slope * up, up], axis=-1)
 
 
 def stand_on(slope: jax.Array, yaw: jax.Array) -> jax.Array:
