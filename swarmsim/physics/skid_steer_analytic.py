@@ -69,7 +69,7 @@ def analytic_step(
         angular_velocity_rad_s=yaw_rate / upright * jnp.array([0.0, 0.0, 1.0]),
     )
     return SkidSteerState(
-        body=_laid_down(moved, body, rotation[2, 2] < LYING_COSINE, fell | _tips(params, weight)),
+        body=_laid_down(moved, body, rotation, fell | _tips(params, weight)),
         wheel_angle_rad=state.wheel_angle_rad + dt * wheel_speed,
         wheel_speed_rad_s=wheel_speed,
         wheel_torque_nm=torque,
@@ -190,10 +190,15 @@ def _tips(params: SkidSteerParams, weight: jax.Array) -> jax.Array:
     return jnp.any(_height(params) * held > 0.5 * down * jnp.stack([base, track])) | (down <= 0.0)
 
 
-def _laid_down(moved: RigidState, before: RigidState, lies: jax.Array, tips: jax.Array) -> RigidState:
-    """``moved``, or at rest on its side where it ``tips`` [], or as it was ``before`` where it ``lies`` []."""
+def _laid_down(moved: RigidState, before: RigidState, rotation: jax.Array, tips: jax.Array) -> RigidState:
+    """``moved``, or at rest on its lower side where it ``tips`` [], or as it was ``before`` where it lies already.
+
+    ``rotation`` [3, 3] is that before, body to world.
+    """
+    lies = rotation[2, 2] < LYING_COSINE
     half = jnp.sqrt(0.5)
-    on_side = multiply(before.quaternion, jnp.stack([half, half, 0.0 * half, 0.0 * half]))
+    roll = jnp.where(rotation[2, 1] > 0.0, half, -half)  # towards the right where the left side is higher
+    on_side = multiply(before.quaternion, jnp.stack([half, roll, 0.0 * half, 0.0 * half]))
     quaternion = jnp.where(lies, before.quaternion, jnp.where(tips, on_side, moved.quaternion))
     still = lies | tips
     return dataclasses.replace(
