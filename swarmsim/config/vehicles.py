@@ -210,10 +210,11 @@ class WheelMotor(Model):
 
 
 class Bumper(Model):
-    """Spring-damper of each corner of the rover's outline against walls."""
+    """Spring-damper of each point of the chassis that meets ground or the edge of a step, with Coulomb friction."""
 
     stiffness_n_m: Positive
     damping_n_s_m: NonNegative
+    friction: NonNegative
 
 
 class SkidSteerControl(Model):

@@ -9,7 +9,9 @@ import jax.numpy as jnp
 from swarmsim.physics import rotations, wheel_contact, wheels
 from swarmsim.physics.rotations import to_body, to_world
 from swarmsim.physics.skid_steer_analytic import analytic_step
-from swarmsim.site import Site, sample_with_gradient
+from swarmsim.physics.step_contact import spring_wrench, step_under, wheel_ground
+from swarmsim.physics.walls import near_walls, stopped_by
+from swarmsim.site import Site
 from swarmsim.vehicles.skid_steer import SkidSteerParams, tyre_sinkage
 from swarmsim.vehicles.state import RigidState, SkidSteerState
 
@@ -37,7 +39,8 @@ def rest_state(params: SkidSteerParams, site: Site, xy: jax.Array, yaw: jax.Arra
     All wheels stand on the tangent plane below the centre of mass.
     """
     xy = jnp.asarray(xy, float)
-    height, slope = sample_with_gradient(site.terrain_m, site, xy)
+    ground = jax.tree.map(lambda x: x[0], step_under(site, xy[None]))
+    height, slope = ground.low_m + jnp.where(ground.beyond_m > 0.0, ground.rise_m, 0.0), ground.slope
     quaternion = wheels.stand_on(slope, jnp.asarray(yaw, float))
     up = jax.lax.rsqrt(1.0 + jnp.sum(slope * slope))
     drop = params.wheel_radius_m - tyre_sinkage(params) - jnp.mean(params.wheel_position_m[:, 2])
@@ -61,17 +64,22 @@ def mjx_step(
     rotation = rotations.rotation_matrix(body.quaternion)
     torque = wheels.motor_torque(params, state, command_rad_s, dt)
     hub = body.position_m + to_world(rotation, params.wheel_position_m)
-    height, normal = wheels.ground_planes(site, hub[:, :2])
-    distance = (hub[:, 2] - height) * normal[:, 2] - params.wheel_radius_m
-    push, turn = wheels.bumper_wrench(params, state, rotation, site)
-    force = to_body(rotation, jnp.append(push, -params.mass_kg * params.gravity_m_s2))
+    ground = wheel_ground(params, site, rotation, hub)
+    push, moment = spring_wrench(params, body, rotation, ground, stepped=site.steps is not None)
+    force = to_body(rotation, push) - params.mass_kg * params.gravity_m_s2 * rotation[2]
     velocity = to_body(rotation, body.velocity_m_s)
     twist = jnp.concatenate([velocity, body.angular_velocity_rad_s, state.wheel_speed_rad_s])
     wheel_torque = torque + wheels.rolling_torque(params, state.wheel_speed_rad_s)
-    smooth = wheel_contact.smooth_force(params, twist, force, turn * rotation[2], wheel_torque)
-    change = dt * wheel_contact.accelerations(params, twist, smooth, distance, to_body(rotation, normal))
+    smooth = wheel_contact.smooth_force(params, twist, force, moment, wheel_torque)
+    change = dt * wheel_contact.accelerations(
+        params, twist, smooth, ground.distance_m, to_body(rotation, ground.normal), radius=ground.radius_m
+    )
     velocity = body.velocity_m_s + to_world(rotation, change[:3])
     spin = body.angular_velocity_rad_s + change[3:6]
+    yaw_rate = jnp.sum(rotation[2] * spin)
+    held, turn = stopped_by(near_walls(params, body, rotation, site), params, velocity[:2], yaw_rate, dt)
+    velocity = jnp.append(held, velocity[2])
+    spin = spin + (turn - yaw_rate) * rotation[2]
     wheel_speed = state.wheel_speed_rad_s + change[6:]
     turned = rotations.multiply(body.quaternion, rotations.from_rotation_vector(dt * spin))
     return SkidSteerState(

@@ -1,26 +1,33 @@
-"""Closed-form model of a skid-steer rover that follows the terrain, without a contact solver, for the largest sweeps.
+"""Model of a skid-steer rover that follows the terrain, without a contact solver, for the largest sweeps.
 
-Three motions are integrated separately: along the wheels (traction up to friction x load, rolling resistance), turning
-(effective track and turning resistance of `swarmsim.vehicles.skid_steer`) and sideways (slides when the side force
-exceeds friction). Coulomb friction is implicit in each, so any step size is stable and the rover comes to rest exactly.
-Height and attitude are those of the plane through the ground below the four wheels.
+The rover moves in the plane through the ground below its four wheels. Each tyre has Coulomb friction against its slip
+along and across the wheel, under its share of the weight on the slope. Friction is implicit with a coefficient from the
+slip before (lagged diffusivity: Vogel and Oman, SIAM J. Sci. Comput. 17(1), 1996): one linear equation in the three
+velocities, solved by hand, and stable for any step.
+
+Limits. It has no motion normal to the ground: no suspension, no bouncing, and no wheel leaves the ground. Weight shifts
+between the wheels with the slope, not with acceleration. Where that does not hold the rover is laid on its side, where
+it stays, and the world records a crash: when gravity tips it over its wheels, and when a wheel drives off a step higher
+than ``step_max_m``. A face higher than ``step_max_m`` stops the wheels; a lower one is rolled over.
 """
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 
 from swarmsim.physics import wheels
-from swarmsim.physics.rotations import rotation_matrix, to_body, to_world, yaw_of
-from swarmsim.site import Site, sample
-from swarmsim.vehicles.skid_steer import (
-    SkidSteerParams,
-    effective_track,
-    turning_force,
-    tyre_creep,
-    tyre_sinkage,
-    wheel_spacing,
-)
+from swarmsim.physics.rotations import multiply, rotation_matrix, to_body, to_world, yaw_of
+from swarmsim.physics.step_contact import step_under
+from swarmsim.physics.walls import Walls, near_walls, stopped_by
+from swarmsim.site import Site
+from swarmsim.site.steps import StepAt
+from swarmsim.vehicles.skid_steer import SkidSteerParams, tyre_creep, tyre_sinkage, wheel_spacing
 from swarmsim.vehicles.state import RigidState, SkidSteerState
+
+ITERATIONS = 2  # of the friction coefficients in each step
+LYING_COSINE = 0.5  # tilted by more than 60 degrees: it lies, and stays
+FALLEN_M = 0.03  # a wheel this far within a face came from above
 
 
 def analytic_step(
@@ -30,26 +37,39 @@ def analytic_step(
     body = state.body
     rotation = rotation_matrix(body.quaternion)
     torque = wheels.motor_torque(params, state, command_rad_s, dt)
-    push, turn = wheels.bumper_wrench(params, state, rotation, site)
-    pushed = to_body(rotation, jnp.append(push, -params.mass_kg * params.gravity_m_s2))
-    load = jnp.maximum(-pushed[2], 0.0)
-    speed, side, _ = to_body(rotation, body.velocity_m_s)
-    speed, wheel_mean = _roll(dt, params, speed, state.wheel_speed_rad_s, torque, pushed[0], load)
-    hold = dt * params.friction * load / params.mass_kg
-    side = _coulomb(side + dt * pushed[1] / params.mass_kg, hold, tyre_creep(params))
-    wheel_half_difference, yaw_rate = _turn(dt, params, state.wheel_speed_rad_s, torque, turn, load)
-    velocity = to_world(rotation, jnp.stack([speed, side, jnp.zeros(())]))
-    yaw = yaw_of(body.quaternion) + dt * yaw_rate
-    position, quaternion = _stand(params, site, body.position_m[:2] + dt * velocity[:2], yaw)
+    weight = -params.mass_kg * params.gravity_m_s2 * rotation[2]
+    load = _loads(params, weight)
+    forward, side, _ = to_body(rotation, body.velocity_m_s)
+    motion, wheel_speed = _slide(
+        dt,
+        params,
+        jnp.stack([forward, side, body.angular_velocity_rad_s[2]]),
+        state.wheel_speed_rad_s,
+        torque,
+        weight,
+        load,
+    )
+    velocity = to_world(rotation, jnp.append(motion[:2], 0.0))
+    upright = jnp.maximum(rotation[2, 2], 0.1)
+    yaw_rate = motion[2] * upright
+    hub = body.position_m + to_world(rotation, params.wheel_position_m)
+    obstacles = near_walls(params, body, rotation, site)
+    if site.steps is not None:
+        obstacles = _with_faces(obstacles, params, rotation, hub - body.position_m, step_under(site, hub[:, :2]))
+    held, yaw_rate = stopped_by(obstacles, params, velocity[:2], yaw_rate, dt)
+    position, quaternion, fell = _stand(
+        params, site, body.position_m[:2] + dt * held, yaw_of(body.quaternion) + dt * yaw_rate
+    )
     turned = rotation_matrix(quaternion)
-    wheel_speed = wheel_mean + wheel_half_difference * jnp.array([-1.0, 1.0, -1.0, 1.0])
+    forward, side, _ = to_body(rotation, jnp.append(held, velocity[2]))
+    moved = RigidState(
+        position_m=position,
+        quaternion=quaternion,
+        velocity_m_s=to_world(turned, jnp.stack([forward, side, jnp.zeros(())])),
+        angular_velocity_rad_s=yaw_rate / upright * jnp.array([0.0, 0.0, 1.0]),
+    )
     return SkidSteerState(
-        body=RigidState(
-            position_m=position,
-            quaternion=quaternion,
-            velocity_m_s=to_world(turned, jnp.stack([speed, side, jnp.zeros(())])),
-            angular_velocity_rad_s=yaw_rate * turned[2],
-        ),
+        body=_laid_down(moved, body, rotation, fell | _tips(params, weight)),
         wheel_angle_rad=state.wheel_angle_rad + dt * wheel_speed,
         wheel_speed_rad_s=wheel_speed,
         wheel_torque_nm=torque,
@@ -57,76 +77,134 @@ def analytic_step(
     )
 
 
-def _coulomb(speed: jax.Array, most: jax.Array, onset: jax.Array | float = 0.0) -> jax.Array:
-    """``speed`` [] after Coulomb friction, which changes it by at most ``most`` [] (same unit) in the step.
-
-    Below the speed ``onset`` [] the friction is proportional to the speed at the end of the step.
-    """
-    return speed - jnp.clip(speed * most / (most + onset + 1e-9), -most, most)
+def _height(params: SkidSteerParams) -> jax.Array:
+    """Height [] (m) of the centre of mass above the ground under it."""
+    return params.wheel_radius_m - tyre_sinkage(params) - jnp.mean(params.wheel_position_m[:, 2])
 
 
-def _wheels_mass(params: SkidSteerParams) -> jax.Array:
-    """Inertia of the four wheels with their motors as an equivalent mass [] (kg) at the speed of the treads."""
-    return 4.0 * (params.wheel_inertia_kg_m2 + params.rotor_inertia_kg_m2) / _rolling_radius(params) ** 2
+def _loads(params: SkidSteerParams, weight: jax.Array) -> jax.Array:
+    """Load [4] (N) of each wheel under the ``weight`` [3] (N, body), with the moment of its part along the ground."""
+    base, track = wheel_spacing(params.wheel_position_m)
+    lean = _height(params) * weight[:2] * 4.0 / jnp.stack([base * base, track * track])
+    share = -weight[2] + jnp.sum(params.wheel_position_m[:, :2] * lean, axis=-1)
+    return 0.25 * jnp.maximum(share, 0.0)
 
 
-def _rolling_radius(params: SkidSteerParams) -> jax.Array:
-    """Rolling radius [] (m) of a loaded tyre: as in MuJoCo, the contact is halfway between tyre and ground."""
-    return params.wheel_radius_m - 0.5 * tyre_sinkage(params)
-
-
-def _roll(
+def _slide(
     dt: float,
     params: SkidSteerParams,
-    speed: jax.Array,
+    motion: jax.Array,
     wheel_speed: jax.Array,
     torque: jax.Array,
-    push: jax.Array,
+    weight: jax.Array,
     load: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Speed of the rover ahead [] (m/s) and mean wheel speed [] (rad/s) after the step.
+    """Velocity ahead, to the left (m/s) and yaw rate (rad/s) [3], and wheel speeds [4] (rad/s), after the step.
 
-    The traction makes tyre and rover equally fast at the end of the step, up to the limit of friction.
+    ``weight`` [3] (N, body) and ``load`` [4] (N) of each wheel. A wheel that turns freely gives way along its rolling
+    direction: its inertia is in series with the friction there.
     """
-    mass, wheels_mass, radius = params.mass_kg, _wheels_mass(params), _rolling_radius(params)
-    tyre_free = jnp.mean(wheel_speed) * radius + dt * jnp.sum(torque) / radius / wheels_mass
-    speed_free = speed + dt * push / mass
-    grip = dt * params.friction * load
-    impulse = jnp.clip((tyre_free - speed_free) * mass * wheels_mass / (mass + wheels_mass), -grip, grip)
-    resistance = dt * params.rolling_resistance * load / (mass + wheels_mass)
-    tyre = tyre_free - impulse / wheels_mass
-    lost = tyre - _coulomb(tyre, resistance)
-    return speed_free + impulse / mass - lost, (tyre - lost) / radius
+    radius = params.wheel_radius_m - 0.5 * tyre_sinkage(params)  # as in MuJoCo, contact is halfway into the tyre
+    inertia = params.wheel_inertia_kg_m2 + params.rotor_inertia_kg_m2
+    x, y = params.wheel_position_m[:, 0], params.wheel_position_m[:, 1]
+    free = wheel_speed + dt * (torque + wheels.rolling_torque(params, wheel_speed)) / inertia
+    creep = tyre_creep(params)
+    mass, yaw_inertia = params.mass_kg, params.inertia_kg_m2[2, 2]
+    start_x, start_y = mass * motion[0] + dt * weight[0], mass * motion[1] + dt * weight[1]
+    after, speed = motion, wheel_speed
+    for _ in range(ITERATIONS):
+        slip_x = after[0] - after[2] * y - radius * speed
+        slip_y = after[1] + after[2] * x
+        slip = jnp.sqrt(slip_x * slip_x + slip_y * slip_y + 1e-12)
+        across = dt * params.friction * load / jnp.maximum(slip, creep)
+        along = across * inertia / (inertia + radius * radius * across)
+        drive = along * radius * free
+        a, b = mass + jnp.sum(along), mass + jnp.sum(across)
+        p, q = -jnp.sum(along * y), jnp.sum(across * x)
+        w = yaw_inertia + jnp.sum(along * y * y + across * x * x)
+        right_x = start_x + jnp.sum(drive)
+        right_w = yaw_inertia * motion[2] - jnp.sum(drive * y)
+        turn = (right_w - p * right_x / a - q * start_y / b) / (w - p * p / a - q * q / b)
+        ahead = (right_x - p * turn) / a
+        after = jnp.stack([ahead, (start_y - q * turn) / b, turn])
+        speed = free + radius * along * (ahead - turn * y - radius * free) / inertia
+    # The slip may have grown beyond that of its coefficient: the force stays in the cone of friction.
+    pull, push = along * (after[0] - after[2] * y - radius * free), across * (after[1] + after[2] * x)
+    most = dt * params.friction * load
+    inside = jnp.minimum(1.0, most * jax.lax.rsqrt(pull * pull + push * push + 1e-12))
+    pull, push = inside * pull, inside * push
+    change = jnp.stack([-jnp.sum(pull), -jnp.sum(push)])
+    turn = motion[2] + jnp.sum(y * pull - x * push) / yaw_inertia
+    return jnp.append((jnp.stack([start_x, start_y]) + change) / mass, turn), free + radius * pull / inertia
 
 
-def _turn(
-    dt: float, params: SkidSteerParams, wheel_speed: jax.Array, torque: jax.Array, moment: jax.Array, load: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Half the difference of right and left wheel speeds [] (rad/s) and yaw rate [] (rad/s) after the step."""
-    side = jnp.array([-1.0, 1.0, -1.0, 1.0])
-    lever = 0.5 * effective_track(params.wheel_position_m)
-    inertia = _wheels_mass(params) + params.inertia_kg_m2[2, 2] / (lever * lever)
-    radius = _rolling_radius(params)
-    rolling = (
-        0.25 * load * params.rolling_resistance * jnp.sum(side * jnp.tanh(wheel_speed / wheels.ROLLING_ONSET_RAD_S))
+def _with_faces(walls: Walls, params: SkidSteerParams, rotation: jax.Array, arm: jax.Array, step: StepAt) -> Walls:
+    """``walls`` and the faces that are too high for the wheels at ``arm`` [4, 3] (world) from the centre of mass."""
+    blocks = (step.rise_m > params.step_max_m) & (step.beyond_m < 0.0)
+    return Walls(
+        clearance_m=jnp.concatenate([walls.clearance_m, jnp.where(blocks, _before_face(params, step), 1e3)]),
+        outward=jnp.concatenate([walls.outward, -step.to_high]),
+        arm_m=jnp.concatenate([walls.arm_m, arm[:, :2]]),
     )
-    force = jnp.sum(side * torque) / radius + moment / lever - rolling
-    free = 0.25 * jnp.sum(side * wheel_speed) * radius + dt * force / inertia
-    base, track = wheel_spacing(params.wheel_position_m)
-    # Slip of a tyre over the tread's speed while turning: half the diagonal times b / B, and the yaw rate.
-    onset = tyre_creep(params) * lever * 2.0 * track / base * jax.lax.rsqrt(base * base + track * track)
-    tread = _coulomb(free, dt * turning_force(params, load) / inertia, onset)
-    return tread / radius, tread / lever
 
 
-def _stand(params: SkidSteerParams, site: Site, xy: jax.Array, yaw: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Position [3] and quaternion [4] of the rover over ``xy`` [2] on the plane of the ground below its wheels."""
+def _before_face(params: SkidSteerParams, step: StepAt) -> jax.Array:
+    """Distance [4] (m) that each wheel may still go before it touches the edge of its step."""
+    over = jnp.maximum(params.wheel_radius_m - step.rise_m, 0.0)
+    reach = jnp.sqrt(jnp.maximum(params.wheel_radius_m**2 - over * over, 1e-8))
+    return -step.beyond_m - reach
+
+
+def _stand(
+    params: SkidSteerParams, site: Site, xy: jax.Array, yaw: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Position [3] and quaternion [4] over ``xy`` [2] on the plane of the ground below the wheels, and if one fell.
+
+    At an edge that the wheels can roll over, each stands on the higher of the low level and the edge.
+    """
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     x, y = params.wheel_position_m[:, 0], params.wheel_position_m[:, 1]
-    height = sample(site.terrain_m, site, xy + jnp.stack([c * x - s * y, s * x + c * y], axis=-1))
+    step = step_under(site, xy + jnp.stack([c * x - s * y, s * x + c * y], axis=-1))
+    height, fell = step.low_m, jnp.array(False)
+    if site.steps is not None:
+        on_top = (step.beyond_m > 0.0) & (step.rise_m > 0.0)
+        before = jnp.minimum(-step.beyond_m, params.wheel_radius_m)
+        rolled = step.rise_m - params.wheel_radius_m + jnp.sqrt(params.wheel_radius_m**2 - before**2 + 1e-8)
+        low = (step.rise_m > 0.0) & (step.rise_m <= params.step_max_m) & ~on_top
+        height = height + jnp.where(on_top, step.rise_m, jnp.where(low, jnp.maximum(rolled, 0.0), 0.0))
+        inside = (step.beyond_m < 0.0) & (_before_face(params, step) < -FALLEN_M)
+        fell = jnp.any(inside & (step.rise_m > params.step_max_m))
     base, track = wheel_spacing(params.wheel_position_m)
     climb = 0.5 * jnp.sum(height * jnp.array([1.0, 1.0, -1.0, -1.0])) / base
     bank = 0.5 * jnp.sum(height * jnp.array([1.0, -1.0, 1.0, -1.0])) / track
     ground = jnp.mean(height) - climb * jnp.mean(x) - bank * jnp.mean(y)
-    rise = params.wheel_radius_m - tyre_sinkage(params) - jnp.mean(params.wheel_position_m[:, 2])
-    return jnp.append(xy, ground + rise * jnp.sqrt(1.0 + climb**2 + bank**2)), wheels.attitude(climb, bank, yaw)
+    position = jnp.append(xy, ground + _height(params) * jnp.sqrt(1.0 + climb**2 + bank**2))
+    return position, wheels.attitude(climb, bank, yaw), fell
+
+
+def _tips(params: SkidSteerParams, weight: jax.Array) -> jax.Array:
+    """Whether [] the ``weight`` [3] (N, body) tips the rover over its wheels, which hold it by friction at most."""
+    base, track = wheel_spacing(params.wheel_position_m)
+    down = -weight[2]
+    held = jnp.minimum(jnp.abs(weight[:2]), params.friction * down)
+    return jnp.any(_height(params) * held > 0.5 * down * jnp.stack([base, track])) | (down <= 0.0)
+
+
+def _laid_down(moved: RigidState, before: RigidState, rotation: jax.Array, tips: jax.Array) -> RigidState:
+    """``moved``, or at rest on its lower side where it ``tips`` [], or as it was ``before`` where it lies already.
+
+    ``rotation`` [3, 3] is that before, body to world.
+    """
+    lies = rotation[2, 2] < LYING_COSINE
+    half = jnp.sqrt(0.5)
+    roll = jnp.where(rotation[2, 1] > 0.0, half, -half)  # towards the right where the left side is higher
+    on_side = multiply(before.quaternion, jnp.stack([half, roll, 0.0 * half, 0.0 * half]))
+    quaternion = jnp.where(lies, before.quaternion, jnp.where(tips, on_side, moved.quaternion))
+    still = lies | tips
+    return dataclasses.replace(
+        moved,
+        position_m=jnp.where(still, before.position_m, moved.position_m),
+        quaternion=quaternion,
+        velocity_m_s=jnp.where(still, 0.0, moved.velocity_m_s),
+        angular_velocity_rad_s=jnp.where(still, 0.0, moved.angular_velocity_rad_s),
+    )

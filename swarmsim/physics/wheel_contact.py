@@ -42,18 +42,25 @@ def accelerations(
     distance: jax.Array,
     normal: jax.Array,
     iterations: int = NEWTON_ITERATIONS,
+    radius: jax.Array | None = None,
 ) -> jax.Array:
     """Acceleration [10] (m/s^2, rad/s^2) under the generalised force ``smooth`` [10] and the contact of the tyres.
 
     ``twist`` [10] is the generalised velocity, ``distance`` [4] (m) that of each tyre from its ground plane, negative
     in it, ``normal`` [4, 3] the unit normals of the planes in the body frame; ``iterations`` of Newton's method.
+    ``radius`` [4] (m) is that of each wheel towards its plane, by default the wheel's.
     """
-    linear, angular, wheels = solve(contacts(params, twist, smooth, distance, normal), iterations)
+    linear, angular, wheels = solve(contacts(params, twist, smooth, distance, normal, radius), iterations)
     return jnp.concatenate([linear, angular, wheels - _pitch_share(params) * angular[1]])
 
 
 def contacts(
-    params: SkidSteerParams, twist: jax.Array, smooth: jax.Array, distance: jax.Array, normal: jax.Array
+    params: SkidSteerParams,
+    twist: jax.Array,
+    smooth: jax.Array,
+    distance: jax.Array,
+    normal: jax.Array,
+    radius: jax.Array | None = None,
 ) -> Contacts:
     """The contact problem; arguments as those of `accelerations`.
 
@@ -64,7 +71,9 @@ def contacts(
     friction, share = params.friction, _pitch_share(params)
     opening = friction / FRICTION_RATIO**0.5
     pitch = _pitch()
-    reach = params.wheel_radius_m + 0.5 * distance  # MuJoCo's contact point is halfway between tyre and plane
+    reach = (
+        params.wheel_radius_m if radius is None else radius
+    ) + 0.5 * distance  # MuJoCo's contact point is halfway between tyre and plane
     arm = params.wheel_position_m - normal * reach[:, None]
     in_plane = jax.lax.rsqrt(jnp.maximum(normal[:, 0] ** 2 + normal[:, 2] ** 2, 1e-6))
     ahead = jnp.stack([normal[:, 2] * in_plane, jnp.zeros(4), -normal[:, 0] * in_plane], axis=-1)

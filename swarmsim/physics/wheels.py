@@ -1,10 +1,8 @@
-"""Loads of a skid-steer rover other than tyre contact: motors, rolling resistance, walls; ground planes; battery."""
+"""Loads of a skid-steer rover other than tyre contact: motors, rolling resistance; attitude on a slope; battery."""
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.physics.rotations import rotation_matrix
-from swarmsim.site import Site, sample_with_gradient
 from swarmsim.vehicles.skid_steer import SkidSteerParams
 from swarmsim.vehicles.state import SkidSteerState
 
@@ -30,53 +28,6 @@ def energy_used(params: SkidSteerParams, state: SkidSteerState, torque_nm: jax.A
     """Energy [] (J) drawn since the start: |torque x speed| through the drive's efficiency, and the avionics."""
     shaft = jnp.sum(jnp.abs(torque_nm * state.wheel_speed_rad_s))
     return state.energy_j + dt * (shaft / params.drive_efficiency + params.avionics_power_w)
-
-
-def ground_planes(site: Site, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Tangent planes of the terrain at ``xy`` [n, 2] (m, world): heights [n] (m) and unit normals [n, 3], world."""
-    height, slope = sample_with_gradient(site.terrain_m, site, xy)
-    up = jax.lax.rsqrt(1.0 + jnp.sum(slope * slope, axis=-1, keepdims=True))
-    return height, jnp.concatenate([-slope * up, up], axis=-1)
-
-
-def wall_contact(
-    params: SkidSteerParams, state: SkidSteerState, rotation: jax.Array, site: Site
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Contact of the outline's corners with walls.
-
-    Returns the depth [4] (m, > 0 in the wall), the direction out of the wall [4, 2] (unit, world), the speed into the
-    wall [4] (m/s) and the corners' positions from the centre of mass [4, 2] (m, world). ``rotation`` [3, 3]: body to
-    world.
-    """
-    arm = jnp.sum(rotation[:2, :2] * params.corner_m[:, None, :], axis=-1)
-    clearance, gradient = sample_with_gradient(site.clearance_m, site, state.body.position_m[:2] + arm)
-    outward = gradient * jax.lax.rsqrt(jnp.sum(gradient * gradient, axis=-1, keepdims=True) + 1e-12)
-    spin = jnp.sum(rotation[2] * state.body.angular_velocity_rad_s)
-    velocity = state.body.velocity_m_s[:2] + spin * jnp.stack([-arm[:, 1], arm[:, 0]], axis=-1)
-    return -clearance, outward, -jnp.sum(velocity * outward, axis=-1), arm
-
-
-def bumper_wrench(
-    params: SkidSteerParams, state: SkidSteerState, rotation: jax.Array, site: Site
-) -> tuple[jax.Array, jax.Array]:
-    """Force [2] (N, world x and y) and moment [] (N m, about the vertical) of the walls on the rover.
-
-    A spring-damper at each corner pushes along the gradient of the clearance, without friction. It acts at the height
-    of the centre of mass, so a wall neither lifts nor tips the rover.
-    """
-    depth, outward, approach, arm = wall_contact(params, state, rotation, site)
-    push = params.bumper_stiffness_n_m * depth + params.bumper_damping_n_s_m * approach
-    force = outward * jnp.where(depth > 0.0, jnp.maximum(push, 0.0), 0.0)[:, None]
-    return force.sum(axis=0), jnp.sum(arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0])
-
-
-def impact_speed(params: SkidSteerParams, state: SkidSteerState, site: Site) -> jax.Array:
-    """Largest speed [] (m/s) of a corner into the wall that it touches; 0 without contact.
-
-    A value above ``params.impact_speed_max_m_s`` is a collision.
-    """
-    depth, _, approach, _ = wall_contact(params, state, rotation_matrix(state.body.quaternion), site)
-    return jnp.max(jnp.where(depth > 0.0, jnp.maximum(approach, 0.0), 0.0))
 
 
 def stand_on(slope: jax.Array, yaw: jax.Array) -> jax.Array:

@@ -1,7 +1,7 @@
 """Paths of rovers: routes over the traversability cost of a site, rounded and given speeds."""
 
+import math
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from swarmsim.config.vehicles import SkidSteer
 from swarmsim.policies.path import Path, limit_speed, resample
 from swarmsim.policies.protocol import Assignment
-from swarmsim.policies.routes import coarsen, smooth
-from swarmsim.pytree import on_host
+from swarmsim.policies.routes import coarsen, passable, smooth
+from swarmsim.pytree import on_host, pytree
 from swarmsim.site import Site, sample
 
 ROUTE_CELL_M = 1.0  # routes are planned on cells of about this size
@@ -46,18 +46,36 @@ def planning_cells(site: Site) -> tuple[int, float]:
     return block, block * cell
 
 
-def rover_limits(assignment: Assignment) -> tuple[Any, Any]:
-    """Clearance [M] (m) that each rover needs, and the acceleration [M] of its paths (host)."""
+@pytree
+class RoverLimits:
+    """Where M rovers can drive and how; each of them has what is said of one here."""
+
+    radius_m: jax.Array  # [M] clearance that it needs
+    slope_max: jax.Array  # [M] rise per metre
+    step_max_m: jax.Array  # [M]
+    acceleration_m_s2: jax.Array  # [M] of its paths
+
+
+def rover_limits(assignment: Assignment) -> RoverLimits:
+    """Limits of the rovers of a phase, from their specifications (host)."""
     specs = [assignment.scenario.vehicles[i] for i in assignment.members]
     rovers = [spec for spec in specs if isinstance(spec, SkidSteer)]
-    radius = [0.5 * spec.chassis_size_m[1] + ROVER_MARGIN_M for spec in rovers]
-    acceleration = [0.5 * spec.control.acceleration_max_m_s2 for spec in rovers]
-    return on_host(radius), on_host(acceleration)
+    return RoverLimits(
+        radius_m=on_host([0.5 * spec.chassis_size_m[1] + ROVER_MARGIN_M for spec in rovers]),
+        slope_max=on_host([math.tan(math.radians(spec.slope_max_deg)) for spec in rovers]),
+        step_max_m=on_host([spec.step_max_m for spec in rovers]),
+        acceleration_m_s2=on_host([0.5 * spec.control.acceleration_max_m_s2 for spec in rovers]),
+    )
 
 
-def route_grid(site: Site, radius_m: jax.Array, block: int, start_m: jax.Array) -> RouteGrid:
-    """The grid for a rover of a radius that stands at ``start_m`` [2]; its own cell is always open."""
-    cost = coarsen(site.cost, site.clearance_m, radius_m, block)
+def route_grid(site: Site, limits: RoverLimits, block: int, start_m: jax.Array) -> RouteGrid:
+    """The grid for one rover with its ``limits`` that stands at ``start_m`` [2]; its own cell is always open.
+
+    It keeps clear of slopes and steps that are too much for the site's rules (`swarmsim.config.site.Traversability`) or
+    for the rover.
+    """
+    cost = jnp.where(passable(site, limits.slope_max, limits.step_max_m), site.cost, jnp.inf)
+    cost = coarsen(cost, site.clearance_m, limits.radius_m, block)
     grid = RouteGrid(cost=cost, origin_m=site.origin_m + 0.5 * (block - 1) * site.cell_m, cell_m=site.cell_m * block)
     start = grid.cell_of(start_m)
     return RouteGrid(cost=cost.at[start[0], start[1]].min(START_COST), origin_m=grid.origin_m, cell_m=grid.cell_m)

@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.config.policies import ApproachAndOrbit as ApproachAndOrbitSettings
-from swarmsim.policies.ground_path import ROUTE_POINTS, ground_path, planning_cells, route_grid, rover_limits
+from swarmsim.policies.ground_path import (
+    ROUTE_POINTS,
+    RoverLimits,
+    ground_path,
+    planning_cells,
+    route_grid,
+    rover_limits,
+)
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
@@ -26,8 +33,7 @@ class SearchTask:
 
     standoff_m: jax.Array  # [] distance at which to look at the target
     speed_m_s: jax.Array  # []
-    acceleration_m_s2: jax.Array  # [M]
-    radius_m: jax.Array  # [M] clearance that each rover needs
+    limits: RoverLimits
     viewpoints: int = static()  # places round the target to visit
     laps: int = static()  # times round the target
     block: int = static()  # cells of the site's rasters along one edge of a planning cell
@@ -47,12 +53,10 @@ class ApproachAndOrbit:
         settings = assignment.settings
         assert isinstance(settings, ApproachAndOrbitSettings)
         block, cell = planning_cells(assignment.site_model.site)
-        radius, acceleration = rover_limits(assignment)
         return SearchTask(
             standoff_m=on_host(settings.standoff_m),
             speed_m_s=on_host(settings.speed_m_s),
-            acceleration_m_s2=acceleration,
-            radius_m=radius,
+            limits=rover_limits(assignment),
             viewpoints=settings.viewpoints,
             laps=settings.laps,
             block=block,
@@ -67,8 +71,8 @@ class ApproachAndOrbit:
         visited in their order round the target, from the one that is cheapest to reach.
         """
 
-        def one(position: jax.Array, radius: jax.Array, acceleration: jax.Array) -> Path:
-            grid = route_grid(site, radius, task.block, position[:2])
+        def one(position: jax.Array, limits: RoverLimits) -> Path:
+            grid = route_grid(site, limits, task.block, position[:2])
             target = grid.cell_of(situation.target_m)
             from_start = cost_to_go(grid.cost, grid.cell_of(position[:2]), grid.cell_m)
             views, reachable = _viewpoints(task, situation.target_m, from_start, grid.cell_of)
@@ -76,9 +80,9 @@ class ApproachAndOrbit:
             approach = descend(from_start, grid.cost, first, grid.cell_m, 2 * sum(grid.cost.shape))[::-1]
             xy = grid.place(jnp.concatenate([approach, legs.reshape(-1, 2)])).at[0].set(position[:2])
             xy = jnp.where(any_leg & situation.found, xy, position[:2])
-            return ground_path(site, xy, task.speed_m_s, acceleration, task.points)
+            return ground_path(site, xy, task.speed_m_s, limits.acceleration_m_s2, task.points)
 
-        return jax.vmap(one)(situation.position_m, task.radius_m, task.acceleration_m_s2)
+        return jax.vmap(one)(situation.position_m, task.limits)
 
 
 def _viewpoints(

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim.site import Site
+
 MOVES = np.array(
     [(r, c) for r in range(-2, 3) for c in range(-2, 3) if abs(r) + abs(c) in (1, 3) or abs(r) == abs(c) == 1]
 )  # (row, column)
@@ -28,6 +30,20 @@ def coarsen(cost: jax.Array, clearance_m: jax.Array, radius_m: jax.Array, factor
 
     fits = blocks(clearance_m).min(axis=-1) >= radius_m
     return jnp.where(fits, blocks(cost).mean(axis=-1), jnp.inf)
+
+
+def passable(site: Site, slope_max: jax.Array, step_max_m: jax.Array) -> jax.Array:
+    """Cells [ny, nx] of a site's rasters where no slope is above ``slope_max`` [] (rise per metre) and no step higher.
+
+    The slope is that between the neighbouring cells, as in the site's own cost. A cell centre has a step near it when
+    one of the four patches of ground around it has.
+    """
+    north, east = jnp.gradient(site.terrain_m)
+    gentle = jnp.hypot(north, east) <= slope_max * site.cell_m
+    if site.steps is None:
+        return gentle
+    high = jnp.pad(site.steps.edge[..., 3] > step_max_m, ((1, 0), (1, 0)))
+    return gentle & ~(high[1:, 1:] | high[1:, :-1] | high[:-1, 1:] | high[:-1, :-1])
 
 
 def _neighbours(field: jax.Array, fill: float) -> jax.Array:

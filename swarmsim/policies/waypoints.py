@@ -10,7 +10,14 @@ import numpy as np
 from swarmsim.config.policies import Waypoints
 from swarmsim.config.vehicles import Multirotor
 from swarmsim.policies.air_path import FlightProfile, air_path, flight_profile, points_for
-from swarmsim.policies.ground_path import ROUTE_POINTS, ground_path, planning_cells, route_grid, rover_limits
+from swarmsim.policies.ground_path import (
+    ROUTE_POINTS,
+    RoverLimits,
+    ground_path,
+    planning_cells,
+    route_grid,
+    rover_limits,
+)
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
@@ -35,8 +42,7 @@ class GroundWaypoints:
 
     corners_m: jax.Array  # [W, 2] of all laps, world
     speed_m_s: jax.Array  # []
-    acceleration_m_s2: jax.Array  # [M]
-    radius_m: jax.Array  # [M] clearance that each rover needs
+    limits: RoverLimits
     block: int = static()  # cells of the site's rasters along one edge of a planning cell
     points: int = static()
 
@@ -67,12 +73,10 @@ class WaypointsPlanner:
                 points=points,
             )
         block, _ = planning_cells(assignment.site_model.site)
-        radius, acceleration = rover_limits(assignment)
         return GroundWaypoints(
             corners_m=on_host(corners),
             speed_m_s=on_host(settings.speed_m_s),
-            acceleration_m_s2=acceleration,
-            radius_m=radius,
+            limits=rover_limits(assignment),
             block=block,
             points=max(ROUTE_POINTS, 32 * len(corners)),
         )
@@ -83,15 +87,15 @@ class WaypointsPlanner:
             fly = partial(_fly, task, site)
             return jax.vmap(fly)(situation.position_m, task.home_m)
         drive = partial(_drive, task, site)
-        return jax.vmap(drive)(situation.position_m, task.radius_m, task.acceleration_m_s2)
+        return jax.vmap(drive)(situation.position_m, task.limits)
 
 
 def _fly(task: AirWaypoints, site: Site, position: jax.Array, home: jax.Array) -> Path:
     return air_path(task.profile, site, position, home, task.corners_m, task.points)
 
 
-def _drive(task: GroundWaypoints, site: Site, position: jax.Array, radius: jax.Array, acceleration: jax.Array) -> Path:
-    grid = route_grid(site, radius, task.block, position[:2])
+def _drive(task: GroundWaypoints, site: Site, position: jax.Array, limits: RoverLimits) -> Path:
+    grid = route_grid(site, limits, task.block, position[:2])
     steps = 2 * sum(grid.cost.shape)
 
     def leg(here: jax.Array, corner: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -104,4 +108,4 @@ def _drive(task: GroundWaypoints, site: Site, position: jax.Array, radius: jax.A
 
     _, legs = jax.lax.scan(leg, grid.cell_of(position[:2]), task.corners_m)
     xy = legs.reshape(-1, 2).at[0].set(position[:2])
-    return ground_path(site, xy, task.speed_m_s, acceleration, task.points)
+    return ground_path(site, xy, task.speed_m_s, limits.acceleration_m_s2, task.points)

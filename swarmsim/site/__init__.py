@@ -1,6 +1,6 @@
 """Ground truth of a site: terrain, obstacles, materials, and path lengths of rays through them."""
 
-from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh, sample, sample_with_gradient
+from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh, sample, sample_with_gradient
 from swarmsim.site.rays import path_lengths
 from swarmsim.site.store import ImportOptions, import_site, load_site
 
@@ -9,6 +9,7 @@ __all__ = [
     "Obstacles",
     "Site",
     "SiteModel",
+    "Steps",
     "VisualMesh",
     "import_site",
     "load_site",

@@ -20,6 +20,7 @@ from swarmsim.site.model import VisualMesh
 from swarmsim.site.obstacles import Box, boxes_of, components
 from swarmsim.site.raster import Floats, Grid, faces_on, top_of_cells
 from swarmsim.site.source_files import TIFF_SUFFIXES, check_file
+from swarmsim.site.step_edges import StepRasters, find_steps
 from swarmsim.site.survey import survey_area
 from swarmsim.site.visual import visual_mesh
 
@@ -39,6 +40,7 @@ class RawSite:
     surface: Floats  # [ny, nx] m
     clearance: Floats  # [ny, nx] m
     cost: Floats  # [ny, nx]
+    steps: StepRasters | None
     boxes: list[Box]
     box_materials: list[str]
     survey_area: Floats  # [v, 2] m
@@ -63,6 +65,8 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
     clear = traversability.clearance(
         grid, ground.height, ground.outside, corners[solid], stopping, spec.zones, spec.traversability
     )
+    carries = is_ground | solid
+    steps = find_steps(grid, ground.height, clear, corners[carries], spec.traversability.step_max_m)
     kept = sorted(np.argsort([-box.volume for box in boxes], kind="stable")[:BOXES_MAX])
     report = {
         "parts": [
@@ -72,7 +76,7 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
         "boxes_left_out": len(boxes) - len(kept),
     }
     return _finish(
-        grid, ground, surface, clear, [boxes[i] for i in kept], [names[i] for i in kept],
+        grid, ground, surface, clear, steps, [boxes[i] for i in kept], [names[i] for i in kept],
         visual_mesh(parts, is_ground, spec), spec, report,
     )  # fmt: skip
 
@@ -89,14 +93,16 @@ def _from_elevation(path: Path, spec: SiteSpec) -> RawSite:
     nothing = np.empty((0, 3, 3))
     clear = traversability.clearance(grid, ground.height, ground.outside, nothing, [], spec.zones, spec.traversability)
     report = {"parts": [], "boxes_left_out": 0, "georeference": model.reference}
-    return _finish(grid, ground, ground.height, clear, [], [], elevation_mesh(model, grid, ground), spec, report)
+    return _finish(grid, ground, ground.height, clear, None, [], [], elevation_mesh(model, grid, ground), spec, report)
 
 
 def _finish(
-    grid: Grid, ground: Ground, surface: Floats, clear: Floats, boxes: list[Box], names: list[str],
+    grid: Grid, ground: Ground, surface: Floats, clear: Floats, steps: StepRasters | None,
+    boxes: list[Box], names: list[str],
     mesh: VisualMesh, spec: SiteSpec, report: dict[str, Any],
 ) -> RawSite:  # fmt: skip
-    cost = traversability.cost(grid, ground.height, clear, spec.traversability)
+    rise = None if steps is None else steps.edge[..., 3]
+    cost = traversability.cost(grid, ground.height, clear, spec.traversability, rise)
     inside = ~ground.outside
     slope = np.degrees(np.arctan(np.hypot(*np.gradient(ground.height, grid.cell))))
     report |= {
@@ -119,7 +125,7 @@ def _finish(
     if not np.isfinite(cost).any():
         report["warnings"].append("no cell is traversable: a rover cannot drive here")
     area = survey_area(grid, inside, spec)
-    return RawSite(grid, ground.height, surface, clear, cost, boxes, names, area, mesh, report)
+    return RawSite(grid, ground.height, surface, clear, cost, steps, boxes, names, area, mesh, report)
 
 
 def _matches(part: Part, pattern: str) -> bool:

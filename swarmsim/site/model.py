@@ -24,6 +24,19 @@ class Obstacles:
 
 
 @pytree
+class Steps:
+    """Vertical faces of the ground such as kerbs and ledges: at most one straight edge near each patch of ground.
+
+    A patch lies between four cell centres, [i, j] the south-west one. Within it the ground is the bilinear one of
+    ``floor_m``, less the rise at those cell centres that lie beyond the edge, plus the rise wherever one is beyond it.
+    """
+
+    floor_m: jax.Array  # [ny, nx] height that wheels stand on: bare ground, and what is low enough to be driven over
+    edge: jax.Array  # [ny, nx, 4] unit vector (x, y) to the high side, distance of the edge (m) from the south-west
+    # cell centre along it, rise (m); zeros where there is none
+
+
+@pytree
 class Site:
     """A site on the device. Raster rows run south to north (y), columns west to east (x)."""
 
@@ -36,6 +49,7 @@ class Site:
     obstacles: Obstacles
     survey_area_m: jax.Array  # [V, 2] ENU convex polygon, counter-clockwise
     ground_material: jax.Array  # [] int32 index into material_names
+    steps: Steps | None = None  # None: the ground has no steps
     material_names: tuple[str, ...] = static()  # order of the materials table
 
 

@@ -24,7 +24,7 @@ from swarmsim.config.load import load_model, load_named
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import SiteSpec
 from swarmsim.pytree import on_device
-from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
+from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh
 from swarmsim.site.source_files import MAX_FILE_MB, check_file
 
 Arrays = dict[str, np.ndarray]
@@ -116,6 +116,7 @@ def _pack(raw: Any) -> Arrays:
         "surface": raw.surface.astype(np.float32),
         "clearance": raw.clearance.astype(np.float32),
         "cost": raw.cost.astype(np.float32),
+        **_pack_steps(raw.steps),
         "boxes": boxes,
         "box_materials": np.array(raw.box_materials, dtype=np.str_),
         "survey_area": raw.survey_area.astype(np.float32),
@@ -124,6 +125,12 @@ def _pack(raw: Any) -> Arrays:
         "colours": raw.mesh.colours,
         "report": np.array(json.dumps(raw.report)),
     }
+
+
+def _pack_steps(steps: Any) -> Arrays:
+    if steps is None:
+        return {}
+    return {"step_floor": steps.floor.astype(np.float32), "step_edge": steps.edge.astype(np.float32)}
 
 
 def _checked(arrays: Arrays) -> Arrays:
@@ -158,11 +165,18 @@ def _model(spec: SiteSpec, arrays: Arrays, material_names: Sequence[str]) -> Sit
         cost=on_device(arrays["cost"]),
         obstacles=obstacles,
         survey_area_m=on_device(arrays["survey_area"]),
+        steps=_steps(arrays),
         ground_material=on_device(names.index(spec.ground_material), np.int32),
         material_names=tuple(names),
     )
     mesh = VisualMesh(arrays["vertices"], arrays["triangles"], arrays["colours"])
     return SiteModel(name=spec.name, spec=spec, site=site, mesh=mesh, report=json.loads(str(arrays["report"])))
+
+
+def _steps(arrays: Arrays) -> Steps | None:
+    if "step_edge" not in arrays:
+        return None
+    return Steps(floor_m=on_device(arrays["step_floor"]), edge=on_device(arrays["step_edge"]))
 
 
 def import_site(

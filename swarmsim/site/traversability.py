@@ -65,8 +65,11 @@ def _touched(fine: Grid, ground: Floats, corners: Floats, rules: Traversability)
     return blocked
 
 
-def cost(grid: Grid, ground: Floats, clear: Floats, rules: Traversability) -> Floats:
-    """Cost [ny, nx] of driving one metre (formula: `swarmsim.config.site.Traversability`); inf where impassable."""
+def cost(grid: Grid, ground: Floats, clear: Floats, rules: Traversability, rise: Floats | None = None) -> Floats:
+    """Cost [ny, nx] of driving one metre (formula: `swarmsim.config.site.Traversability`); inf where impassable.
+
+    ``rise`` [ny, nx] is that of the steps near the patch between four cell centres, [i, j] the south-west one.
+    """
     north, east = np.gradient(ground, grid.cell)
     slope = np.hypot(north, east)
     steepest = np.tan(np.radians(rules.slope_max_deg))
@@ -74,4 +77,8 @@ def cost(grid: Grid, ground: Floats, clear: Floats, rules: Traversability) -> Fl
     near = np.clip(1.0 - clear / rules.obstacle_distance_m, 0.0, 1.0)
     total = 1.0 + rules.slope_weight * (slope / steepest) ** 2
     total = total + rules.roughness_weight * roughness + rules.obstacle_weight * near**2
-    return np.where((slope <= steepest) & (clear > 0.0), total, np.inf)
+    passable = (slope <= steepest) & (clear > 0.0)
+    if rise is not None:
+        around = np.pad(rise, ((1, 0), (1, 0)))  # a cell centre has a patch on either side
+        passable &= ndimage.maximum_filter(around, 2)[1:, 1:] <= rules.step_max_m
+    return np.where(passable, total, np.inf)

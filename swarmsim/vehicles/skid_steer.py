@@ -29,6 +29,7 @@ class SkidSteerParams:
     inertia_kg_m2: jax.Array  # [3, 3] the whole rover about its centre of mass
     wheel_position_m: jax.Array  # [4, 3] wheel centres
     wheel_radius_m: jax.Array  # []
+    wheel_width_m: jax.Array  # []
     wheel_inertia_kg_m2: jax.Array  # [] one wheel about its axle
     rotor_inertia_kg_m2: jax.Array  # [] motor and gears of one wheel, as the wheel feels them
     friction: jax.Array  # [] Coulomb coefficient between tyre and ground
@@ -41,8 +42,11 @@ class SkidSteerParams:
     speed_gain_nm_s: jax.Array  # [] torque per wheel-speed error
     wheel_speed_max_rad_s: jax.Array  # []
     corner_m: jax.Array  # [4, 2] corners of the outline in the body's x-y plane
-    bumper_stiffness_n_m: jax.Array  # [] per corner
-    bumper_damping_n_s_m: jax.Array  # [] per corner
+    hull_m: jax.Array  # [2, 3] lowest and highest corner of the chassis
+    hull_stiffness_n_m: jax.Array  # [] per point of contact
+    hull_damping_n_s_m: jax.Array  # [] per point of contact
+    hull_friction: jax.Array  # [] Coulomb coefficient between chassis and ground
+    step_max_m: jax.Array  # [] highest step that it climbs
     impact_speed_max_m_s: jax.Array  # [] hitting a wall faster is a collision
     battery_capacity_j: jax.Array  # []
     drive_efficiency: jax.Array  # [] battery to wheel
@@ -60,11 +64,14 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
     body = body or rover_body(spec)
     rear, front, right, left = body.outline_m
     stiffness, damping = tyre_constants(spec, body)
+    half = 0.5 * np.array(spec.chassis_size_m)
+    middle = np.array([0.0, 0.0, spec.chassis_height_m - body.wheel_radius_m + body.wheel_position_m[0, 2]])
     values = {
         "mass_kg": body.mass_kg,
         "inertia_kg_m2": body.inertia_kg_m2,
         "wheel_position_m": body.wheel_position_m,
         "wheel_radius_m": body.wheel_radius_m,
+        "wheel_width_m": body.wheel_width_m,
         "wheel_inertia_kg_m2": body.wheel_inertia_kg_m2[0],
         "rotor_inertia_kg_m2": spec.motor.rotor_inertia_kg_m2,
         "friction": spec.wheels.friction,
@@ -77,8 +84,11 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
         "speed_gain_nm_s": spec.motor.speed_gain_nm_s,
         "wheel_speed_max_rad_s": spec.motor.speed_max_rad_s,
         "corner_m": [[front, left], [front, right], [rear, left], [rear, right]],
-        "bumper_stiffness_n_m": spec.bumper.stiffness_n_m,
-        "bumper_damping_n_s_m": spec.bumper.damping_n_s_m,
+        "hull_m": [-half + middle, half + middle],
+        "hull_stiffness_n_m": spec.bumper.stiffness_n_m,
+        "hull_damping_n_s_m": spec.bumper.damping_n_s_m,
+        "hull_friction": spec.bumper.friction,
+        "step_max_m": spec.step_max_m,
         "impact_speed_max_m_s": spec.impact_speed_max_m_s,
         "battery_capacity_j": 3600.0 * spec.battery.capacity_wh,
         "drive_efficiency": spec.battery.drive_efficiency,

@@ -11,7 +11,7 @@ from swarmsim.control.skid_steer import pursue, wheel_speeds
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.rotations import rotation_matrix
 from swarmsim.physics.skid_steer import make_skid_steer_step, rest_state
-from swarmsim.physics.wheels import impact_speed
+from swarmsim.physics.walls import impact_speed
 from swarmsim.scalars import Layout
 from swarmsim.site import Site
 from swarmsim.vehicles.skid_steer import SkidSteerParams
@@ -66,7 +66,7 @@ def tick(
     yaw_rate = jnp.where(armed, jnp.where(to_point, yaw_rate, command.yaw_rate_rad_s), 0.0)
     steered = wheel_speeds(params, speed, yaw_rate, vehicle)
     wheels = jnp.where(armed & (command.level > DRIVE), command.wheel_speed_rad_s, steered)
-    hit = impact_speed(params, vehicle, site)  # before the bumpers take the speed off
+    hit = impact_speed(params, vehicle, site, substeps * dt)  # before the wall takes the speed off
 
     def one(vehicle: SkidSteerState, _: None) -> tuple[SkidSteerState, None]:
         return step(params, vehicle, wheels, site), None
@@ -101,5 +101,5 @@ def crashed(
 def obstructed(
     params: SkidSteerParams, vehicle: SkidSteerState, wall: Plane, impact_m_s: jax.Array, limits: Limits, site: Site
 ) -> jax.Array:
-    """Whether [] it hit a wall faster than its bumpers take."""
+    """Whether [] it hit a wall faster than it may."""
     return impact_m_s > limits.impact_speed_m_s

@@ -1,5 +1,6 @@
 """Rovers and sites for the tests of the skid-steer physics, and the same rover in MuJoCo C."""
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import yaml
 from swarmsim.config.vehicles import SkidSteer
 from swarmsim.physics.skid_steer import make_skid_steer_step, rest_state
 from swarmsim.physics.wheels import ROLLING_ONSET_RAD_S
-from swarmsim.site import Obstacles, Site
+from swarmsim.site import Obstacles, Site, Steps
 from swarmsim.vehicles.skid_steer import skid_steer_mjcf, skid_steer_params, tyre_sinkage
 
 FILE = Path(__file__).parents[2] / "configs" / "vehicles" / "orpheus.yaml"
@@ -48,6 +49,17 @@ def plane_site(slope=(0.0, 0.0), wall_east_m=None, cells=80, cell=1.0) -> Site:
         ground_material=jnp.int32(0),
         material_names=("soil",),
     )
+
+
+def step_site(rise_m, distance_m=1.0, angle=0.0, cells=81, cell=0.5) -> Site:
+    """Level ground that is higher by ``rise_m`` beyond a straight edge, ``distance_m`` from the origin at ``angle``."""
+    site = plane_site(cells=cells, cell=cell)
+    axis = (np.arange(cells) - cells // 2) * cell
+    x, y = np.meshgrid(axis, axis)
+    beyond = np.cos(angle) * x + np.sin(angle) * y - distance_m
+    edge = np.stack(np.broadcast_arrays(np.cos(angle), np.sin(angle), -beyond, rise_m), axis=-1)
+    steps = Steps(floor_m=jnp.asarray(rise_m * (beyond > 0.0), jnp.float32), edge=jnp.asarray(edge, jnp.float32))
+    return dataclasses.replace(site, terrain_m=steps.floor_m, steps=steps)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmsim.policies.ground_path import RoverLimits
 from swarmsim.policies.ground_search import ApproachAndOrbit, SearchTask
 from swarmsim.policies.routes import coarsen, cost_to_go, descend, smooth
+from swarmsim.site import Steps
 from tests.policies.assignments import assignment, situation
 from tests.policies.sites import block_site
 
@@ -17,12 +19,17 @@ plan = jax.jit(planner.plan)
 TARGET = (10.0, 4.0)
 
 
-def make_task(rovers=1, standoff=4.0, viewpoints=8, radius=0.6, laps=1):
+def make_task(rovers=1, standoff=4.0, viewpoints=8, radius=0.6, laps=1, slope_max=0.36, step_max=0.12):
+    limits = RoverLimits(
+        radius_m=jnp.full(rovers, radius),
+        slope_max=jnp.full(rovers, slope_max),
+        step_max_m=jnp.full(rovers, step_max),
+        acceleration_m_s2=jnp.full(rovers, 0.5),
+    )
     return SearchTask(
         standoff_m=jnp.float32(standoff),
         speed_m_s=jnp.float32(0.9),
-        acceleration_m_s2=jnp.full(rovers, 0.5),
-        radius_m=jnp.full(rovers, radius),
+        limits=limits,
         viewpoints=viewpoints,
         laps=laps,
         block=2,
@@ -118,8 +125,8 @@ def test_each_rover_has_its_own_route_by_its_own_width():
     """Through a gap of 4 m the narrow one goes, the wide one round the wall."""
     site = block_site([(-2, -30, 0, -2.0), (-2, 2.0, 0, 20)])
     task = make_task(rovers=2)
-    wide = jnp.array([0.6, 2.6])
-    paths = plan(dataclasses.replace(task, radius_m=wide), site, situation([(-20.0, -2.0), (-20.0, 2.0)], TARGET))
+    limits = dataclasses.replace(task.limits, radius_m=jnp.array([0.6, 2.6]))
+    paths = plan(dataclasses.replace(task, limits=limits), site, situation([(-20.0, -2.0), (-20.0, 2.0)], TARGET))
     narrow, wide = np.asarray(paths.points_m)
     np.testing.assert_allclose(narrow[0, :2], [-20.0, -2.0], atol=1e-3)
     np.testing.assert_allclose(wide[0, :2], [-20.0, 2.0], atol=1e-3)
@@ -144,11 +151,42 @@ def test_the_task_of_a_phase_has_the_rovers_limits_and_sizes():
         "approach_and_orbit", "orpheus", [(-30.0, -20.0)], site, target=TARGET, speed_m_s=0.8, standoff_m=5.0, laps=2
     )
     task = planner.task(made)
-    np.testing.assert_allclose(task.radius_m, [0.5 * 0.42 + 0.3])  # half the chassis and a margin
-    np.testing.assert_allclose(task.acceleration_m_s2, [0.5])
+    np.testing.assert_allclose(task.limits.radius_m, [0.5 * 0.42 + 0.3])  # half the chassis and a margin
+    np.testing.assert_allclose(task.limits.acceleration_m_s2, [0.5])
+    np.testing.assert_allclose(task.limits.slope_max, np.tan(np.radians(20.0)), rtol=1e-6)
+    np.testing.assert_allclose(task.limits.step_max_m, 0.12)
     assert (task.viewpoints, task.laps, task.block, task.window) == (8, 2, 2, 25)
     path = jax.tree.map(lambda x: x[0], plan(task, site, situation([(-30.0, -20.0)], TARGET)))
     distance = np.linalg.norm(np.asarray(path.points_m)[:, :2] - TARGET, axis=1)
     assert distance.min() > 3.5
     assert np.all(np.asarray(path.speed_m_s) <= 0.8 + 1e-6)
     np.testing.assert_allclose(np.linalg.norm(np.diff(path.points_m, axis=0), axis=1).max(), path.spacing_m, rtol=0.05)
+
+
+def bank(x, y):
+    """A bank along x = 0, of 10 degrees, with a gentle way round in the north."""
+    height = np.tan(np.radians(10.0)) * np.clip(x + 3.0, 0.0, 6.0)
+    return height * np.clip((20.0 - y) / 10.0, 0.0, 1.0)
+
+
+def test_each_rover_keeps_to_the_slope_that_it_climbs():
+    site = block_site(terrain=bank)
+    steep, gentle = (drive((-30.0, -5.0), TARGET, site, slope_max=np.tan(np.radians(d))) for d in (15.0, 7.0))
+    assert np.asarray(steep.points_m)[:, 1].max() < 10.0
+    crossing = np.asarray(gentle.points_m)
+    assert np.all(crossing[np.abs(crossing[:, 0]) < 2.0, 1] > 12.0)
+
+
+@pytest.mark.parametrize(("rise", "crosses"), [(0.1, True), (0.13, False)])
+def test_a_step_higher_than_the_rover_climbs_is_gone_round(rise, crosses):
+    """A kerb along x = 0 that ends at y = 15."""
+    site = block_site()
+    rows, columns = site.terrain_m.shape
+    edge = np.zeros((rows, columns, 4), np.float32)
+    west = round(-float(site.origin_m[0]) / 0.5) - 1
+    south = np.arange(rows) * 0.5 + float(site.origin_m[1])
+    edge[south < 15.0, west] = [1.0, 0.0, 0.25, rise]
+    site = dataclasses.replace(site, steps=Steps(floor_m=site.terrain_m, edge=jnp.asarray(edge)))
+    path = np.asarray(drive((-30.0, 0.0), TARGET, site).points_m)
+    at_kerb = path[np.abs(path[:, 0]) < 0.4, 1]
+    assert (at_kerb.min() < 14.0) == crosses
