@@ -1,6 +1,10 @@
-"""What of a multirotor's aerodynamics and power a mission takes into account."""
+"""How a mission's multirotors fly: which effects are taken into account, and their failsafes."""
 
-from swarmsim.config.base import Model
+from typing import Literal
+
+from pydantic import Field
+
+from swarmsim.config.base import Fraction, Model, NonNegative, Positive
 
 
 class FlightEffects(Model):
@@ -16,3 +20,56 @@ class FlightEffects(Model):
     ground_effect: bool = True
     battery_sag: bool = True
     downwash: bool = True
+
+
+Action = Literal["none", "hold", "return", "land"]
+
+
+class Failsafe(Model):
+    """What sets in, and what the vehicle then does; ``none``: nothing."""
+
+    action: Action = "none"
+
+
+class Fence(Failsafe):
+    """The site's outline less ``margin_m``, and a ceiling above the terrain. It is felt a braking distance ahead."""
+
+    action: Action = "return"
+    margin_m: NonNegative = 0.0
+    ceiling_m: Positive = 120.0
+
+
+class WindFailsafe(Failsafe):
+    """The wind takes a ``share`` of the largest horizontal acceleration of the vehicle for ``after_s``."""
+
+    action: Action = "land"
+    share: float = Field(default=0.9, gt=0, le=1)
+    after_s: NonNegative = 2.0
+
+
+class BatteryFailsafe(Failsafe):
+    """No more than ``charge`` of the battery is left (PX4's default BAT_LOW_THR is 0.15)."""
+
+    action: Action = "return"
+    charge: Fraction = 0.15
+
+
+class LinkFailsafe(Failsafe):
+    """Further than ``range_m`` from its start, where the ground station is, for ``after_s`` (PX4's COM_DL_LOSS_T)."""
+
+    range_m: Positive = 1000.0
+    after_s: NonNegative = 10.0
+
+
+class Failsafes(Model):
+    """What autopilots do by themselves, as PX4 and ArduPilot do; the action ``none`` switches one off.
+
+    A vehicle that returns climbs to ``return_clearance_m`` above everything on the site, flies to where it started, and
+    lands there.
+    """
+
+    fence: Fence = Fence()
+    wind: WindFailsafe = WindFailsafe()
+    battery: BatteryFailsafe = BatteryFailsafe()
+    link: LinkFailsafe = LinkFailsafe()
+    return_clearance_m: NonNegative = 5.0

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec2
-from swarmsim.config.flight import FlightEffects
+from swarmsim.config.flight import Failsafes, FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
 from swarmsim.config.vehicles import Vehicle
 
@@ -209,6 +209,7 @@ class Mission(Model):
     vehicles: tuple[TeamMember, ...] = Field(min_length=1, max_length=TEAM_MAX)
     wind: Wind = Wind()
     effects: FlightEffects = FlightEffects()
+    failsafes: Failsafes = Failsafes()
     traffic: Traffic = Traffic()
     radio: Radio = Radio()
     mapping: Mapping | None = None

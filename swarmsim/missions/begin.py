@@ -133,7 +133,9 @@ def begin_phase(world: World, plan: Plan, mission: MissionState, number: int) ->
     for place in phase.places:
         local = jnp.asarray(place.local)
         group = groups[place.group]
-        active = group.active.at[local].set(events.able(group.event_time_s)[local])
+        times = group.event_time_s[local]
+        flies_home = group.active[local] & events.rescued(times)
+        active = group.active.at[local].set(events.able(times) | flies_home)
         groups[place.group] = replace(group, active=active)
         phase_of[place.group] = phase_of[place.group].at[local].set(number)
     mission = replace(mission, world=replace(mission.world, groups=tuple(groups)), phase_of=tuple(phase_of))

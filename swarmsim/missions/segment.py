@@ -12,6 +12,7 @@ from swarmsim.estimation.windows import gather
 from swarmsim.missions.frame import frame
 from swarmsim.missions.plan import Phase, Plan, Trigger
 from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track
+from swarmsim.world import events
 from swarmsim.world.model import World
 from swarmsim.world.state import now_s
 
@@ -202,7 +203,10 @@ def _ended(
     lost_s, taken = jnp.full(phase.size, jnp.inf), jnp.zeros(phase.size, bool)
     for place in phase.places:
         local, rank = jnp.asarray(place.local), jnp.asarray(place.rank)
-        first = jnp.min(mission.world.groups[place.group].event_time_s[local], axis=-1)
+        group = mission.world.groups[place.group]
+        times = group.event_time_s[local]
+        first = jnp.min(times[:, : len(events.LOSSES)], axis=-1)
+        first = jnp.where(events.rescued(times) & ~group.active[local], jnp.minimum(first, now), first)
         lost_s = lost_s.at[rank].set(first)
         taken = taken.at[rank].set(mission.phase_of[place.group][local] != number)
     part_s = jnp.minimum(state.done_s, lost_s)

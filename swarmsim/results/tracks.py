@@ -39,13 +39,13 @@ def vehicle_record(
         velocity_m_s=track["velocity_m_s"],
         energy_wh=energy_wh,
         battery_fraction=np.clip(1.0 - energy_wh / spec.battery.capacity_wh, 0.0, 1.0),
-        crashed=bool(np.isfinite(event_time_s).any()),
+        crashed=bool(np.isfinite(event_time_s[: len(events.LOSSES)]).any()),
         shape=shape_of(spec),
     )
 
 
 def losses(vehicle: str, event_time_s: jax.Array | np.ndarray) -> list[Event]:
-    """What ended the part of a vehicle, from its event times [kinds]."""
+    """What ended the part of a vehicle in the mission, from its event times [kinds]."""
     return [
         Event(float(time), vehicle, kind, events.DESCRIPTIONS[kind])
         for kind, time in zip(events.KINDS, event_time_s, strict=True)

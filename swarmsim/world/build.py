@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike
 
 from swarmsim.config.checks import footprint_radius_m
 from swarmsim.config.errors import InputError
+from swarmsim.config.flight import Failsafe
+from swarmsim.config.mission import Mission
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.physics.multirotor import check_time_step
@@ -17,13 +19,16 @@ from swarmsim.pytree import on_host
 from swarmsim.radiation.detector import Detector, Source, build_detector
 from swarmsim.radiation.library import Library
 from swarmsim.sensors.radiation import Counter
-from swarmsim.site import SiteModel
+from swarmsim.site import Site, SiteModel
 from swarmsim.site.model import height_at
 from swarmsim.site.walls import walls_of
 from swarmsim.vehicles.multirotor import multirotor_params
 from swarmsim.vehicles.skid_steer import skid_steer_params
+from swarmsim.world.failsafes import ACTIONS, HOLD, FailsafeRules
 from swarmsim.world.model import Air, Group, Limits, Radio, Timing, TrafficRules, World
 
+NOWHERE_M = 1e6
+"""Distance [m] of a fence that is never met."""
 EVALUATION_PERIOD_S = 0.12  # the rate of a detector is evaluated about this often during an exposure
 
 Spec = Multirotor | SkidSteer
@@ -79,6 +84,7 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
             separation_m=_f32(mission.traffic.separation_m),
             ground_separation_m=_f32(mission.traffic.ground_separation_m),
         ),
+        failsafes=_failsafes(mission, site),
         radio=Radio(
             range_m=_f32(radio.range_m if radio.range_m is not None else np.inf),
             loss=_f32(radio.loss),
@@ -88,6 +94,28 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
         groups=tuple(_group(scenario, members, timing, library) for members in grouped(scenario)),
         timing=timing,
         engine=mission.engine,
+    )
+
+
+def _failsafes(mission: Mission, site: Site) -> FailsafeRules:
+    rules = mission.failsafes
+    origin = np.asarray(site.origin_m, np.float64)
+    rows, columns = np.shape(site.terrain_m)
+    end = origin + float(site.cell_m) * (np.array([columns, rows]) - 1)
+    kinds: list[Failsafe] = [rules.fence, rules.wind, rules.battery, rules.link]
+    fence, wind, battery, link = (kind.action != "none" for kind in kinds)
+    margin = rules.fence.margin_m if fence else -NOWHERE_M
+    return FailsafeRules(
+        fence_low_m=_f32(origin + margin),
+        fence_high_m=_f32(end - margin),
+        ceiling_m=_f32(rules.fence.ceiling_m if fence else NOWHERE_M),
+        wind_share=_f32(rules.wind.share if wind else np.inf),
+        wind_s=_f32(rules.wind.after_s),
+        battery_low=_f32(rules.battery.charge if battery else -1.0),
+        link_range_m=_f32(rules.link.range_m if link else np.inf),
+        link_s=_f32(rules.link.after_s),
+        return_height_m=_f32(float(np.max(np.asarray(site.surface_m))) + rules.return_clearance_m),
+        action=on_host([ACTIONS.get(kind.action, HOLD) for kind in kinds], np.int32),
     )
 
 
@@ -137,7 +165,7 @@ def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library
             params[id(spec)] = _params(scenario, spec, timing)
     return Group(
         params=_stack([params[id(spec)] for spec in specs]),
-        limits=_limits(specs, [params[id(spec)] for spec in specs]),
+        limits=_limits(specs, [params[id(spec)] for spec in specs], _f32([m.position_m for m in team])),
         counter=_counter(scenario, specs, timing, library),
         start_m=_f32([m.position_m for m in team]),
         yaw_rad=_f32(np.radians([m.heading_deg for m in team])),
@@ -153,7 +181,7 @@ def _params(scenario: Scenario, spec: Spec, timing: Timing) -> Any:
     return multirotor_params(embodied(spec), scenario.mission.effects)
 
 
-def _limits(specs: Sequence[Spec], params: Sequence[Any]) -> Limits:
+def _limits(specs: Sequence[Spec], params: Sequence[Any], home_m: Any) -> Limits:
     def half_height(spec: Spec) -> float:
         return 0.5 * (spec.collision_height_m if isinstance(spec, Multirotor) else spec.chassis_size_m[2])
 
@@ -170,6 +198,7 @@ def _limits(specs: Sequence[Spec], params: Sequence[Any]) -> Limits:
         deck_m=_f32([deck(spec, own) for spec, own in zip(specs, params, strict=True)]),
         impact_speed_m_s=_f32([spec.impact_speed_max_m_s for spec in specs]),
         battery_j=_f32([3600.0 * spec.battery.capacity_wh for spec in specs]),
+        home_m=home_m,
     )
 
 

@@ -48,7 +48,7 @@ def counted(
     counter, counter_state = group.counter, before.counter
     if counter is None or counter_state is None:
         return after
-    measuring = before.active & events.able(after.event_time_s)
+    measuring = before.active & events.intact(after.event_time_s)
     counter_state = unread(counter_state)
     for place, body in enumerate(seen):
         tick = (first // counter.ticks + 1 + place) * counter.ticks

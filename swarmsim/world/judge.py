@@ -13,6 +13,7 @@ from swarmsim.site import sample
 from swarmsim.world import events
 from swarmsim.world.collisions import Bodies, collide
 from swarmsim.world.decks import on_decks
+from swarmsim.world.failsafes import failing, rescue_of
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below, wall_beside
@@ -20,6 +21,9 @@ from swarmsim.world.neighbours import DENSE_MAX, WINDOW, candidates, cleared, no
 from swarmsim.world.radio import broadcast
 from swarmsim.world.right_of_way import kept_aside, reach_of, right_of_way
 from swarmsim.world.state import GroupState, Surroundings, WorldState
+
+AIRBORNE_M = 0.5
+"""Height of its feet above which a multirotor's failsafes are on."""
 
 
 def look_around(world: World, state: WorldState, number: jax.Array) -> tuple[WorldState, list[jax.Array]]:
@@ -47,10 +51,27 @@ def record_events(
     crash = kind.crashed(params, state.vehicle, height, impact, limits)
     obstacle = kind.obstructed(params, state.vehicle, state.around.wall, impact, limits, world.site)
     empty = state.vehicle.energy_j > limits.battery_j
-    happened = jnp.stack([crash, obstacle, collided, empty, jnp.array(False)]) & state.finite
-    happened = happened.at[events.NON_FINITE].set(~state.finite) & state.active
+    lost = jnp.stack([crash, obstacle, collided, empty, jnp.array(False)]) & state.finite
+    lost = lost.at[events.NON_FINITE].set(~state.finite)
+    rescue, body, dt = state.around.rescue, state.vehicle.body, world.timing.judge_period_s
+    failing_now = jnp.zeros(len(events.FAILSAFES), bool)
+    if rescue is not None:
+        flies = state.active & (height > AIRBORNE_M) & state.finite
+        failing_now, rescue = failing(
+            world.failsafes, rescue, position_m=body.position_m, velocity_m_s=body.velocity_m_s,
+            brake_m_s2=params.control.acceleration_max_m_s2, strain=kind.strain(params, state.control),
+            above_m=body.position_m[2] - sample(world.site.terrain_m, world.site, body.position_m[:2]),
+            charge=1.0 - state.vehicle.energy_j / limits.battery_j, home_m=limits.home_m, dt=dt,
+        )  # fmt: skip
+        failing_now = failing_now & flies & events.able(state.event_time_s)
+    happened = jnp.concatenate([lost, failing_now]) & state.active
     times = events.record(state.event_time_s, happened, now_s)
-    return replace(state, event_time_s=times, impact_m_s=jnp.zeros_like(state.impact_m_s))
+    active = state.active
+    if rescue is not None:
+        rescue = rescue_of(world.failsafes, rescue, times, body.position_m, height, world.site, limits.home_m)
+        active = active & ~(events.rescued(times) & kind.landed(state.control))
+    around = replace(state.around, rescue=rescue)
+    return replace(state, event_time_s=times, around=around, active=active, impact_m_s=jnp.zeros_like(impact))
 
 
 def _refreshed(
@@ -96,7 +117,7 @@ def _in_traffic(
     """Groups after collisions, with what others ask of each; who has collided [U]; whether the search overflowed."""
     flies = jnp.concatenate([jnp.full(group.size, KINDS[group.kind].FLIES) for group in world.groups])
     active = jnp.concatenate([g.active for g in groups])
-    able = active & jnp.concatenate([events.able(g.event_time_s) for g in groups])
+    able = active & jnp.concatenate([events.intact(g.event_time_s) for g in groups])
     height = jnp.concatenate([g.around.height_m for g in groups])
     position = jnp.concatenate([g.vehicle.body.position_m for g in groups])
     velocity = jnp.concatenate([g.vehicle.body.velocity_m_s for g in groups])

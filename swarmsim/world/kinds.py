@@ -8,6 +8,7 @@ from swarmsim.physics.contact import Plane
 from swarmsim.scalars import Layout
 from swarmsim.site import Site
 from swarmsim.world import multirotor, skid_steer
+from swarmsim.world.failsafes import Rescue
 from swarmsim.world.model import Limits
 
 
@@ -34,6 +35,15 @@ class Kind(Protocol):
         wall: Plane, wind_m_s: jax.Array, site: Site, *, engine: str, dt: float, substeps: int, layout: Layout,
     ) -> tuple[Any, Any, jax.Array]:  # fmt: skip
         """Vehicle, controller and impact speed [] after one control period; ``layout`` is how it is mapped."""
+
+    def rescued(self, command: Any, rescue: Rescue) -> Any:
+        """The command, or what the autopilot does by itself; of a kind that flies, as are the next two."""
+
+    def strain(self, params: Any, control: Any) -> jax.Array:
+        """Share [] of the largest horizontal acceleration that the wind takes."""
+
+    def landed(self, control: Any) -> jax.Array:
+        """Whether [] it stands on the ground with its motors off."""
 
     def knocked(self, params: Any, vehicle: Any, velocity_m_s: jax.Array, spin_nms: jax.Array) -> Any:
         """The vehicle after a change of its velocity [3] and an angular impulse [3] N m s, both world."""

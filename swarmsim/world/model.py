@@ -14,6 +14,7 @@ from swarmsim.scalars import Layout
 from swarmsim.sensors.radiation import Counter
 from swarmsim.site import Site
 from swarmsim.site.walls import Walls
+from swarmsim.world.failsafes import FailsafeRules
 
 
 @pytree
@@ -78,6 +79,7 @@ class Limits:
     deck_m: jax.Array  # [U, 3] half length, half width and height over the origin of a rover's upper side; else zero
     impact_speed_m_s: jax.Array  # [U] largest speed at which it may meet the ground or a wall
     battery_j: jax.Array  # [U] capacity
+    home_m: jax.Array  # [U, 2] where it started, world
 
 
 @pytree
@@ -107,6 +109,7 @@ class World:
     sources: Source  # leading axis S >= 1; a source of no activity stands in for none
     air: Air
     traffic: TrafficRules
+    failsafes: FailsafeRules
     radio: Radio
     groups: tuple[Group, ...]
     timing: Timing

@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from swarmsim.control.commands import MultirotorCommand, PositionCommand, multirotor_command
-from swarmsim.control.multirotor import ControlMemory, control
+from swarmsim.control.commands import POSITION, MultirotorCommand, PositionCommand, multirotor_command
+from swarmsim.control.multirotor import ControlMemory, control, is_landed
 from swarmsim.control.multirotor import control_start as controller
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.multirotor import make_multirotor_step, rest_state
@@ -16,7 +16,8 @@ from swarmsim.scalars import Layout
 from swarmsim.site import Site, sample, sample_with_gradient
 from swarmsim.site.walls import LOWEST_M, Walls, wall_near
 from swarmsim.vehicles.multirotor import MultirotorParams
-from swarmsim.vehicles.state import MultirotorState
+from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState
+from swarmsim.world.failsafes import Rescue
 from swarmsim.world.model import Limits
 
 FLIES = True
@@ -77,6 +78,31 @@ def stay(params: MultirotorParams, vehicle: MultirotorState) -> PositionCommand:
     return PositionCommand(
         position_m=zero, velocity_m_s=zero, acceleration_m_s2=zero, yaw_rad=yaw, hold_position=jnp.zeros(())
     )
+
+
+def rescued(command: Command, rescue: Rescue) -> Command:
+    """The command, or what the autopilot flies by itself; the heading stays as commanded."""
+    here = rescue.takes_over
+    changes: dict[str, Any] = {
+        "position_m": jnp.where(here, rescue.position_m, command.position_m),
+        "velocity_m_s": jnp.where(here, rescue.velocity_m_s, command.velocity_m_s),
+        "acceleration_m_s2": jnp.where(here, 0.0, command.acceleration_m_s2),
+        "hold_position": jnp.where(here, 1.0, command.hold_position),
+    }
+    if isinstance(command, MultirotorCommand):
+        changes["level"] = jnp.where(here, POSITION, command.level)
+    return replace(command, **changes)
+
+
+def strain(params: MultirotorParams, memory: ControlMemory) -> jax.Array:
+    """Horizontal acceleration [] by wind and the like over the largest that the tilt allows."""
+    most = params.control.tilt_max_tan * GRAVITY_M_S2
+    return jnp.sqrt(jnp.sum(memory.disturbance_m_s2[:2] ** 2) + 1e-12) / most
+
+
+def landed(memory: ControlMemory) -> jax.Array:
+    """Whether [] it stands on the ground with its motors off."""
+    return is_landed(memory)
 
 
 def knocked(params: MultirotorParams, vehicle: MultirotorState, velocity_m_s: jax.Array, spin_nms: jax.Array) -> Any:

@@ -9,6 +9,7 @@ from swarmsim.physics.contact import Plane
 from swarmsim.physics.wind import GustState
 from swarmsim.pytree import pytree
 from swarmsim.sensors.radiation import CounterState, Reading
+from swarmsim.world.failsafes import Rescue
 from swarmsim.world.model import World
 
 
@@ -32,6 +33,7 @@ class Surroundings:
     hold: jax.Array  # [U] bool: another vehicle has the right of way
     push_m: jax.Array  # [U, 3] displacement that keeps apart from it, world
     nearest_m: jax.Array  # [U] distance of the nearest other vehicle
+    rescue: Rescue | None  # what its autopilot does by itself; None for what drives
 
 
 @pytree

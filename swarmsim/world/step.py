@@ -18,6 +18,7 @@ from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import counter_start
 from swarmsim.world import events
 from swarmsim.world.counting import counted, not_seen, noted
+from swarmsim.world.failsafes import no_rescue
 from swarmsim.world.judge import look_around, record_events
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
@@ -54,6 +55,7 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
         hold=jnp.zeros(size, bool),
         push_m=jnp.zeros((size, 3)),
         nearest_m=jnp.full(size, jnp.inf, jnp.float32),
+        rescue=jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), no_rescue()) if kind.FLIES else None,
     )
     memory = kind.control_start()
     return GroupState(
@@ -158,7 +160,9 @@ class Moved:
 def move(world: World, kind: str, params: Any, state: GroupState, command: Any) -> Moved:
     """One vehicle after a control period under a full command; ``state`` is its row of the group's."""
     timing = world.timing
-    armed = state.active & events.able(state.event_time_s)
+    armed = state.active & events.intact(state.event_time_s)
+    if state.around.rescue is not None:
+        command = KINDS[kind].rescued(command, state.around.rescue)
     vehicle, control, impact = KINDS[kind].tick(
         params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wall,
         state.around.wind_m_s, world.site,

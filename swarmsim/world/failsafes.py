@@ -1,0 +1,122 @@
+"""What an autopilot does by itself when a mission goes wrong: hold, return or land, as PX4 and ArduPilot do.
+
+A failsafe is latched: it stays until the vehicle has landed. Of several the one that lands comes before the one that
+returns, and that before the one that holds.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.pytree import pytree
+from swarmsim.site import Site, sample
+from swarmsim.world import events
+
+HOLD, RETURN, LAND = range(3)
+ACTIONS = {"hold": HOLD, "return": RETURN, "land": LAND}
+
+REACTION_S = 0.4
+"""Time until a vehicle brakes: it has to be judged, and to tilt."""
+ARRIVED_M = 1.5
+"""Horizontal distance from home within which a returning vehicle descends."""
+CLIMBED_M = 1.0
+"""Height below that of the return from which a vehicle sets out for home."""
+SLOW_BELOW_M = 5.0
+"""Height above ground below which a vehicle descends slowly."""
+DESCENT_M_S, SLOW_DESCENT_M_S = 1.5, 0.6
+"""Rates of descent: PX4's defaults MPC_Z_V_AUTO_DN and, near the ground, MPC_LAND_SPEED."""
+
+
+@pytree
+class FailsafeRules:
+    """When failsafes set in and what they do; a threshold that cannot be reached switches one off."""
+
+    fence_low_m: jax.Array  # [2] south-west corner of the fence, world
+    fence_high_m: jax.Array  # [2] north-east corner
+    ceiling_m: jax.Array  # [] above the terrain
+    wind_share: jax.Array  # [] of the largest horizontal acceleration that the wind takes
+    wind_s: jax.Array  # [] for how long
+    battery_low: jax.Array  # [] charge left
+    link_range_m: jax.Array  # [] from home, where the ground station is
+    link_s: jax.Array  # [] for how long out of range
+    return_height_m: jax.Array  # [] world: above everything that stands on the site
+    action: jax.Array  # [failsafes] int32: HOLD, RETURN or LAND
+
+
+@pytree
+class Rescue:
+    """What a vehicle's autopilot flies by itself."""
+
+    takes_over: jax.Array  # [] bool
+    position_m: jax.Array  # [3] world
+    velocity_m_s: jax.Array  # [3] world
+    strained_s: jax.Array  # [] for how long the wind has been nearly too strong
+    unheard_s: jax.Array  # [] for how long the link has been lost
+
+
+def no_rescue() -> Rescue:
+    """Of a vehicle that does what it is told."""
+    zero = jnp.zeros(())
+    return Rescue(
+        takes_over=jnp.array(False),
+        position_m=jnp.zeros(3),
+        velocity_m_s=jnp.zeros(3),
+        strained_s=zero,
+        unheard_s=zero,
+    )
+
+
+def failing(
+    rules: FailsafeRules, rescue: Rescue, *, position_m: jax.Array, velocity_m_s: jax.Array, brake_m_s2: jax.Array,
+    above_m: jax.Array, strain: jax.Array, charge: jax.Array, home_m: jax.Array, dt: float,
+) -> tuple[jax.Array, Rescue]:  # fmt: skip
+    """Which failsafes [failsafes] set in for one vehicle in flight, and its timers.
+
+    The fence is felt ahead: at the distance that braking by ``brake_m_s2`` [] takes. ``above_m`` [] is the height above
+    the terrain, ``strain`` [] the wind's share of the largest horizontal acceleration, ``charge`` [] what is left of
+    the battery, ``home_m`` [2] where it started.
+    """
+    level = position_m[:2]
+    stop = REACTION_S * velocity_m_s + 0.5 * velocity_m_s * jnp.abs(velocity_m_s) / brake_m_s2
+    ahead, up = level + stop[:2], above_m + stop[2]
+    outside = jnp.any((ahead < rules.fence_low_m) | (ahead > rules.fence_high_m)) | (up > rules.ceiling_m)
+    strained = jnp.where(strain > rules.wind_share, rescue.strained_s + dt, 0.0)
+    away = level - home_m
+    far = jnp.sum(away * away) > rules.link_range_m * rules.link_range_m
+    unheard = jnp.where(far, rescue.unheard_s + dt, 0.0)
+    found = jnp.stack([outside, strained > rules.wind_s, charge < rules.battery_low, far & (unheard > rules.link_s)])
+    return found, Rescue(
+        takes_over=rescue.takes_over,
+        position_m=rescue.position_m,
+        velocity_m_s=rescue.velocity_m_s,
+        strained_s=strained,
+        unheard_s=unheard,
+    )
+
+
+def rescue_of(
+    rules: FailsafeRules, rescue: Rescue, times_s: jax.Array, position_m: jax.Array, height_m: jax.Array, site: Site,
+    home_m: jax.Array,
+) -> Rescue:  # fmt: skip
+    """What one vehicle's autopilot flies now, from its event times [kinds]; ``height_m`` [] is that of its feet."""
+    set_in = jnp.isfinite(times_s[len(events.LOSSES) :])
+    action = jnp.max(jnp.where(set_in, rules.action, -1))
+    away = position_m[:2] - home_m
+    there = jnp.sum(away * away) < ARRIVED_M * ARRIVED_M
+    high = position_m[2] > rules.return_height_m - CLIMBED_M
+    lands = (action == LAND) | ((action == RETURN) & there)
+    cruises = (action == RETURN) & ~there
+    sink = jnp.where(height_m > SLOW_BELOW_M, DESCENT_M_S, SLOW_DESCENT_M_S)
+    # What has been flown to is kept while the vehicle holds or lands, so that the wind does not carry it away.
+    kept = jnp.where(rescue.takes_over, rescue.position_m[:2], position_m[:2])
+    inside = jnp.clip(kept, rules.fence_low_m, rules.fence_high_m)
+    level = jnp.where((action == RETURN) & (there | high), home_m, inside)
+    aim = jnp.where(cruises, jnp.maximum(rules.return_height_m, jnp.where(high, position_m[2], 0.0)), position_m[2])
+    ground = sample(site.terrain_m, site, position_m[:2])
+    aim = jnp.minimum(aim, ground + rules.ceiling_m)
+    return Rescue(
+        takes_over=jnp.any(set_in),
+        position_m=jnp.append(level, aim),
+        velocity_m_s=jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.where(lands, -sink, 0.0)]),
+        strained_s=rescue.strained_s,
+        unheard_s=rescue.unheard_s,
+    )

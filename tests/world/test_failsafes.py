@@ -1,0 +1,127 @@
+"""Failsafes: the fence, the wind, the battery and the link, each an event, and what the autopilot then does."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.control.commands import fly_velocity, go_to
+from swarmsim.world import events
+from tests.world.worlds import airborne, begin, fly, happened, row, with_group, world
+
+COUNT = 4
+RULES = {
+    "fence": {"margin_m": 4.0, "ceiling_m": 30.0},
+    "link": {"action": "return", "range_m": 90.0, "after_s": 1.0},
+    "return_clearance_m": 5.0,
+}
+
+
+@pytest.fixture(scope="module")
+def place():
+    made = world(row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0), failsafes=RULES,
+                 sample_period_s={"nai_1p5x1p5": 1.0})  # fmt: skip
+    return made, begin(made, jax.random.key(5))
+
+
+def at(made, first):
+    """All hover 8 m above their pads, but the first is at ``first``."""
+    pads = np.asarray(made.groups[0].start_m)
+    places = np.concatenate([pads, np.full((COUNT, 1), 8.0)], -1)
+    places[0] = first
+    return places
+
+
+def go(places, velocity):
+    """The first flies at a velocity, the others stay."""
+    stay = jax.vmap(go_to)(jnp.asarray(places, jnp.float32))
+    moves = jax.vmap(fly_velocity)(jnp.tile(jnp.asarray(velocity, jnp.float32), (COUNT, 1)))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b[1:]]), moves, stay)
+
+
+@pytest.mark.parametrize("heading_deg", [0, 90, 180, 270, 37])
+def test_a_vehicle_that_flies_on_to_the_border_returns_and_lands_at_home(place, heading_deg):
+    made, start = place
+    heading = np.radians(heading_deg)
+    velocity = 6.0 * np.array([np.cos(heading), np.sin(heading), 0.0])
+    places = at(made, [0.0, -14.0 if heading_deg not in (90, 270) else 0.0, 8.0])
+    state, tracks = fly(made, airborne(made, start, places), (go(places, velocity),), 45.0)
+    assert "fence" in happened(state)[0]
+    assert not happened(state)[0] & set(events.LOSSES)
+    assert happened(state)[1:] == [set()] * (COUNT - 1)
+    way = tracks[0].position_m[:, 0]
+    assert np.abs(way[:, 0]).max() < 40.0 - 4.0 + 0.3
+    assert np.abs(way[:, 1]).max() < 30.0 - 4.0 + 0.3
+    home = np.asarray(made.groups[0].start_m)[0]
+    np.testing.assert_allclose(way[-1, :2], home, atol=0.3)
+    assert way[-1, 2] < 0.3
+    assert not bool(state.groups[0].active[0])  # it has landed, and rests
+
+
+def test_the_ceiling_is_a_fence_too(place):
+    made, start = place
+    places = at(made, [0.0, -14.0, 20.0])
+    state, tracks = fly(made, airborne(made, start, places), (go(places, [0.0, 0.0, 2.5]),), 6.0)
+    assert happened(state)[0] == {"fence"}
+    assert tracks[0].position_m[:, 0, 2].max() < 30.2
+
+
+def test_a_low_battery_returns_above_everything_that_stands(place):
+    made, start = place
+    places = at(made, [36.0 - 20.0, 0.0, 3.0])
+    up = airborne(made, start, places)
+    vehicle = up.groups[0].vehicle
+    used = vehicle.energy_j.at[0].set(0.86 * float(made.groups[0].limits.battery_j[0]))
+    state, tracks = fly(
+        made, with_group(up, 0, vehicle=replace(vehicle, energy_j=used)), (go(places, [0, 0, 0]),), 50.0
+    )
+    assert "battery_low" in happened(state)[0]
+    way = tracks[0].position_m[:, 0]
+    away = np.linalg.norm(way[:, :2] - np.asarray(made.groups[0].start_m)[0], axis=-1)
+    moving = (away > 2.0) & (away < away[0] - 2.0)
+    assert way[moving, 2].min() > 6.0 + 3.5  # the house is 6 m high
+    assert away[-1] < 0.3
+    assert way[-1, 2] < 0.3
+
+
+def test_a_lost_link_returns_only_after_its_time(place):
+    made, start = place
+    made = replace(made, failsafes=replace(made.failsafes, link_range_m=jnp.float32(25.0)))
+    home = np.asarray(made.groups[0].start_m)[0]
+    places = at(made, [home[0] + 24.0, home[1] + 1.0, 8.0])
+    state, _ = fly(made, airborne(made, start, places), (go(places, [2.0, 0.0, 0.0]),), 1.2)
+    assert happened(state)[0] == set()
+    state, tracks = fly(made, state, (go(places, [2.0, 0.0, 0.0]),), 12.0)
+    assert happened(state)[0] == {"link_lost"}
+    assert np.linalg.norm(tracks[0].position_m[-1, 0, :2] - home) < 10.0
+
+
+@pytest.mark.parametrize("speed", [7.0, 20.0])
+def test_too_strong_a_wind_makes_it_land_where_it_is(speed):
+    team = row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0)
+    made = world(team, blocks=(), sample_period_s={"nai_1p5x1p5": 1.0}, failsafes={"wind": {"share": 0.5}},
+                 wind={"speed_m_s": speed, "from_deg": 270.0})  # fmt: skip
+    start = begin(made, jax.random.key(5))
+    places = at(made, [-20.0, -15.0, 8.0])
+    state, tracks = fly(made, airborne(made, start, places), (go(places, [0, 0, 0]),), 20.0)
+    if speed == 7.0:
+        assert happened(state) == [set()] * COUNT
+        return
+    assert all("wind" in kinds for kinds in happened(state))
+    low = tracks[0].position_m[-1]
+    assert (low[:, 2] < 0.3).all()
+    assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.05
+
+
+def test_failsafes_can_be_switched_off():
+    off = {kind: {"action": "none"} for kind in ("fence", "wind", "battery", "link")}
+    made = world(
+        row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0), failsafes=off, sample_period_s={"nai_1p5x1p5": 1.0}
+    )
+    start = begin(made, jax.random.key(5))
+    places = at(made, [30.0, -14.0, 8.0])
+    state, tracks = fly(made, airborne(made, start, places), (go(places, [6.0, 0, 0]),), 4.0)
+    assert happened(state) == [set()] * COUNT
+    assert tracks[0].position_m[-1, 0, 0] > 45.0
