@@ -7,12 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
 
+from swarmsim.config.vehicles import SkidSteer
 from swarmsim.physics.rotations import rotation_matrix
 from swarmsim.physics.skid_steer import rest_state
 from swarmsim.site import sample
+from swarmsim.vehicles.skid_steer import skid_steer_params
 from tests.physics.mujoco_scenes import Rover, block, plane
-from tests.physics.rovers import ENGINES, PARAMS, SPEC, STEP, drive, plane_site, step_site
+from tests.physics.rovers import ENGINES, FILE, PARAMS, SPEC, STEP, drive, plane_site, step_site
 
 pytestmark = pytest.mark.optimised
 
@@ -214,3 +217,16 @@ def test_the_engines_agree_on_random_slopes():
     apart = np.linalg.norm(paths["mjx"][:, -1, :3] - paths["analytic"][:, -1, :3], axis=-1) / (way + 0.1)
     assert (apart < 0.05).sum() >= 30, np.sort(apart)
     assert apart.max() < 0.2, np.sort(apart)
+
+
+@pytest.mark.parametrize(("command", "rise"), [((-4.0, 4.0, -4.0, 4.0), 0.0), ((6.0,) * 4, 0.05), ((6.0,) * 4, 0.08)])
+def test_a_jackal_moves_as_in_mujoco_c(command, rise):
+    """It turns on the spot within 2 %, passes a kerb of 5 cm and is stopped by one of 8 cm."""
+    spec = SkidSteer(**yaml.safe_load((FILE.parent / "jackal.yaml").read_text()))
+    geoms = [plane(), block([1, -20, -1], [20, 20, rise])] if rise else [plane()]
+    expected = Rover(geoms, spec=spec).drive(command, 3.0)[-1]
+    site = step_site(rise) if rise else plane_site()
+    end = jax.tree.map(lambda x: x[-1], drive("mjx", command, 3.0, site, skid_steer_params(spec)).body)
+    np.testing.assert_allclose(end.position_m, expected[:3], atol=0.03)
+    heading = np.array([expected[3], *expected[4:7]]) @ np.asarray(end.quaternion)
+    assert 2.0 * np.degrees(np.arccos(min(1.0, abs(heading)))) < 4.0
