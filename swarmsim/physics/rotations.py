@@ -31,14 +31,14 @@ def rotation_matrix(q: jax.Array) -> jax.Array:
 def to_world(matrix: jax.Array, v: jax.Array) -> jax.Array:
     """Body vectors ``v`` [..., 3] in the world frame of the attitude ``matrix`` [3, 3].
 
-    A sum, because a dot product of this size would be a kernel of its own.
+    Written out, because a dot product of this size would be a kernel of its own.
     """
-    return jnp.sum(matrix * v[..., None, :], axis=-1)
+    return v[..., :1] * matrix[:, 0] + v[..., 1:2] * matrix[:, 1] + v[..., 2:] * matrix[:, 2]
 
 
 def to_body(matrix: jax.Array, v: jax.Array) -> jax.Array:
     """World vectors ``v`` [..., 3] in the body frame of the attitude ``matrix`` [3, 3]."""
-    return jnp.sum(matrix * v[..., :, None], axis=-2)
+    return v[..., :1] * matrix[0] + v[..., 1:2] * matrix[1] + v[..., 2:] * matrix[2]
 
 
 def conjugate(q: jax.Array) -> jax.Array:

@@ -64,7 +64,9 @@ class _InKernel(Interpreter):
             powers = name in ("pow", "integer_pow") and "float32" not in types
             if name in _NOT_IN_TRITON or powers or not types <= _TYPES or (name == "select_n" and len(values) > 3):
                 raise NotInKernelError(f"{name} of {', '.join(sorted(types))}")
-        if name in ("custom_jvp_call", "custom_vjp_call"):  # a kernel is not differentiated
+        if name == "stop_gradient":  # a kernel is not differentiated
+            return values
+        if name in ("custom_jvp_call", "custom_vjp_call"):
             return self.run(equation.params["call_jaxpr"], values, wanted)
         return super().equation(equation, values, wanted)
 

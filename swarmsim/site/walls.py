@@ -78,7 +78,7 @@ def wall_near(walls: Walls, site: Site, xy: jax.Array, height_m: jax.Array) -> t
 
     low, high = at(lower), at(jnp.minimum(lower + 1, levels - 1))
     # Where one level has no wall at all, the nearer level decides, and not a mean with "nowhere".
-    share = jnp.where(jnp.maximum(low[0], high[0]) < NOWHERE_M / 2, up, jnp.round(up))
+    share = jnp.where(jnp.maximum(low[0], high[0]) < NOWHERE_M / 2, up, jnp.where(up < 0.5, 0.0, 1.0))
     distance, east, north = (a + share * (b - a) for a, b in zip(low, high, strict=True))
     square = east * east + north * north
     steep = jax.lax.rsqrt(jnp.maximum(square, 1e-12))
