@@ -48,7 +48,7 @@ class View:
     velocity_m_s: jax.Array  # [3] world
     angular_velocity_rad_s: jax.Array  # [3] body
     battery: jax.Array  # [] share of the capacity that is left
-    height_m: jax.Array  # [] of its feet above the ground; zero for a rover
+    height_m: jax.Array  # [] of its feet above what is below: ground, a roof or a deck; zero for a rover
     hold: jax.Array  # [] bool: another vehicle has the right of way
     push_m: jax.Array  # [3] displacement that keeps apart from it, world
     nearest_m: jax.Array  # [] distance of the nearest other vehicle; inf where none is near

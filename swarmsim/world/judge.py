@@ -63,7 +63,7 @@ def record_events(
             above_m=body.position_m[2] - sample(world.site.terrain_m, world.site, body.position_m[:2]),
             charge=1.0 - state.vehicle.energy_j / limits.battery_j, home_m=limits.home_m, dt=dt,
         )  # fmt: skip
-        failing_now = failing_now & flies & events.able(state.event_time_s)
+        failing_now = failing_now & flies & events.able(state.event_time_s) & ~jnp.any(lost)
     happened = jnp.concatenate([lost, failing_now]) & state.active
     times = events.record(state.event_time_s, happened, now_s)
     active = state.active
