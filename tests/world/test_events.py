@@ -198,7 +198,7 @@ def test_an_empty_battery_ends_the_flight(world, start):
     state, tracks = fly(
         poor, airborne(poor, start, APART), (jax.vmap(go_to)(jnp.asarray(APART)), stay(world, start)[1]), 3.0
     )
-    assert happened(state) == [set(), set(), {"battery_empty"}, set(), set()]
+    assert happened(state) == [set(), set(), {"battery_low", "battery_empty"}, set(), set()]
     hovering = float(state.groups[0].vehicle.energy_j[0]) / 3.0  # W
     assert times_of(state, "battery_empty")[2] == pytest.approx(150.0 / hovering, abs=0.1)
     assert tracks[0].position_m[:, 2, 2].min() < 0.5
