@@ -6,9 +6,10 @@ import rerun as rr
 from swarmsim.playback.entities import BODY_SCALE, TIMELINE
 from swarmsim.playback.spectrum_figure import spectrum_title
 from swarmsim.results.record import Estimate, MissionRecord
+from swarmsim.world.events import FAILSAFES
 
 _LEVEL = dict.fromkeys(("crash", "obstacle", "vehicle", "non_finite"), "ERROR")
-_LEVEL |= dict.fromkeys(("battery_empty", "time_limit"), "WARN")
+_LEVEL |= dict.fromkeys(("battery_empty", "time_limit", *FAILSAFES), "WARN")
 
 
 def story(record: MissionRecord) -> list[tuple[float, str, str]]:

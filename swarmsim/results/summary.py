@@ -18,6 +18,7 @@ from swarmsim.results.record import (
     VehicleRecord,
 )
 from swarmsim.versions import package_versions
+from swarmsim.world.events import LOSSES
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "rerun-sdk")
 _ESTIMATE_KEYS = (
@@ -37,6 +38,10 @@ STATES = {
     "vehicle": "collided with a vehicle",
     "battery_empty": "battery empty",
     "non_finite": "numerically unstable",
+    "fence": "failsafe at the fence",
+    "wind": "failsafe in the wind",
+    "battery_low": "failsafe of a low battery",
+    "link_lost": "failsafe of a lost link",
 }
 """State of a vehicle in which an event of each kind leaves it."""
 
@@ -105,8 +110,9 @@ def event_summary(event: Event) -> dict[str, Any]:
 
 def state_of(record: MissionRecord, vehicle: VehicleRecord) -> str:
     """State of a vehicle at the end: `INTACT`, or one of `STATES`."""
-    kinds = (event.kind for event in record.events if event.vehicle == vehicle.name and event.kind in STATES)
-    return next((STATES[kind] for kind in kinds), INTACT)
+    kinds = [event.kind for event in record.events if event.vehicle == vehicle.name and event.kind in STATES]
+    lost = [kind for kind in kinds if kind in LOSSES]  # whatever failsafe was on before
+    return next((STATES[kind] for kind in lost + kinds), INTACT)
 
 
 def phase_summary(record: MissionRecord, phase: Phase) -> dict[str, Any]:
