@@ -40,7 +40,7 @@ class Fence(Failsafe):
 
 
 class WindFailsafe(Failsafe):
-    """The wind takes a ``share`` of the largest horizontal acceleration of the vehicle for ``after_s``."""
+    """For ``after_s``, more than a ``share`` of the largest tilt (as tangents) or rotor speed is used."""
 
     action: Action = "land"
     share: float = Field(default=0.9, gt=0, le=1)

@@ -33,7 +33,7 @@ class FailsafeRules:
     fence_low_m: jax.Array  # [2] south-west corner of the fence, world
     fence_high_m: jax.Array  # [2] north-east corner
     ceiling_m: jax.Array  # [] above the terrain
-    wind_share: jax.Array  # [] of the largest horizontal acceleration that the wind takes
+    wind_share: jax.Array  # [] of the largest tilt (as tangents) that the vehicle keeps
     wind_s: jax.Array  # [] for how long
     battery_low: jax.Array  # [] charge left
     link_range_m: jax.Array  # [] from home, where the ground station is
@@ -72,7 +72,7 @@ def failing(
     """Which failsafes [failsafes] set in for one vehicle in flight, and its timers.
 
     The fence is felt ahead: at the distance that braking by ``brake_m_s2`` [] takes. ``above_m`` [] is the height above
-    the terrain, ``strain`` [] the wind's share of the largest horizontal acceleration, ``charge`` [] what is left of
+    the terrain, ``strain`` [] the tilt's share of the largest, ``charge`` [] what is left of
     the battery, ``home_m`` [2] where it started.
     """
     level = position_m[:2]

@@ -59,7 +59,7 @@ def record_events(
         flies = state.active & (height > AIRBORNE_M) & state.finite
         failing_now, rescue = failing(
             world.failsafes, rescue, position_m=body.position_m, velocity_m_s=body.velocity_m_s,
-            brake_m_s2=params.control.acceleration_max_m_s2, strain=kind.strain(params, state.control),
+            brake_m_s2=params.control.acceleration_max_m_s2, strain=kind.strain(params, state.vehicle),
             above_m=body.position_m[2] - sample(world.site.terrain_m, world.site, body.position_m[:2]),
             charge=1.0 - state.vehicle.energy_j / limits.battery_j, home_m=limits.home_m, dt=dt,
         )  # fmt: skip

@@ -16,7 +16,7 @@ from swarmsim.scalars import Layout
 from swarmsim.site import Site, sample, sample_with_gradient
 from swarmsim.site.walls import LOWEST_M, Walls, wall_near
 from swarmsim.vehicles.multirotor import MultirotorParams
-from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState
+from swarmsim.vehicles.state import MultirotorState
 from swarmsim.world.failsafes import Rescue
 from swarmsim.world.model import Limits
 
@@ -94,10 +94,16 @@ def rescued(command: Command, rescue: Rescue) -> Command:
     return replace(command, **changes)
 
 
-def strain(params: MultirotorParams, memory: ControlMemory) -> jax.Array:
-    """Horizontal acceleration [] by wind and the like over the largest that the tilt allows."""
-    most = params.control.tilt_max_tan * GRAVITY_M_S2
-    return jnp.sqrt(jnp.sum(memory.disturbance_m_s2[:2] ** 2) + 1e-12) / most
+def strain(params: MultirotorParams, vehicle: MultirotorState) -> jax.Array:
+    """How near [] it is to the end of what it can do against the wind: 1 at the largest tilt, or with the motors full.
+
+    The larger of the tilt over the largest (as tangents) and the mean rotor speed over what the battery allows.
+    """
+    up = rotation_matrix(vehicle.body.quaternion)[:, 2]
+    level = jnp.sqrt(up[0] * up[0] + up[1] * up[1] + 1e-12)
+    tilt = level / (params.control.tilt_max_tan * jnp.maximum(up[2], 0.1))
+    share = jnp.minimum(1.0, vehicle.voltage_v / jnp.maximum(params.speed_max_voltage_v, 1e-3))
+    return jnp.maximum(tilt, jnp.mean(vehicle.rotor_speed_rad_s) / (share * params.speed_max_rad_s))
 
 
 def landed(memory: ControlMemory) -> jax.Array:

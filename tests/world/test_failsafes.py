@@ -101,7 +101,7 @@ def test_a_lost_link_returns_only_after_its_time(place):
 @pytest.mark.parametrize("speed", [7.0, 20.0])
 def test_too_strong_a_wind_makes_it_land_where_it_is(speed):
     team = row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0)
-    made = world(team, blocks=(), sample_period_s={"nai_1p5x1p5": 1.0}, failsafes={"wind": {"share": 0.5}},
+    made = world(team, blocks=(), sample_period_s={"nai_1p5x1p5": 1.0}, failsafes={"wind": {"share": 0.8}},
                  wind={"speed_m_s": speed, "from_deg": 270.0})  # fmt: skip
     start = begin(made, jax.random.key(5))
     places = at(made, [-20.0, -15.0, 8.0])
