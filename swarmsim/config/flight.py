@@ -19,7 +19,6 @@ class FlightEffects(Model):
     translational_lift: bool = True
     ground_effect: bool = True
     battery_sag: bool = True
-    downwash: bool = True
 
 
 Action = Literal["none", "hold", "return", "land"]
