@@ -73,9 +73,10 @@ def collide(bodies: Bodies, near: Candidates, dt: float) -> Collisions:
     number = jnp.sum(touched, axis=1).astype(jnp.float32)
     impulse = impulse / jnp.maximum(jnp.maximum(number[:, None], of(number)), 1.0)[..., None]
     arm = _arm(bodies, near, at, normal, upright)
+    moves = jnp.isfinite(bodies.mass_kg)[:, None]
     return Collisions(
         velocity_m_s=jnp.sum(impulse, axis=1) / bodies.mass_kg[:, None],
-        spin_nms=jnp.sum(jnp.cross(arm, impulse), axis=1),
+        spin_nms=jnp.where(moves, jnp.sum(jnp.cross(arm, impulse), axis=1), 0.0),
         hit=jnp.any(meets, axis=1),
     )
 

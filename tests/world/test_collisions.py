@@ -82,6 +82,14 @@ def test_one_that_has_no_part_any_more_does_not_give_way():
     np.testing.assert_allclose(change[1], 0.0)
 
 
+def test_one_that_is_not_stepped_is_not_turned_either():
+    """It would keep the rate until it has a part in the mission again."""
+    b = bodies([[0, 0, 0.2], [0.85, 0, 0.3]], [[4.0, 0.5, 0], [0, 0, 0]], [1.0, np.inf], active=[True, False])
+    spin = np.asarray(met(b).spin_nms)
+    assert np.abs(spin[0]).max() > 0.01
+    np.testing.assert_allclose(spin[1], 0.0)
+
+
 def test_derivatives_are_finite():
     def total(position):
         return jnp.sum(met(bodies(position, np.array([[3.0, 0, 0], [0, 0, 0], [0, 0, 0]]))).velocity_m_s ** 2)
