@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from swarmsim.physics import wheels
 from swarmsim.physics.rotations import multiply, rotation_matrix, to_body, to_world, yaw_of
 from swarmsim.physics.step_contact import step_under
-from swarmsim.physics.walls import Walls, near_walls, stopped_by
+from swarmsim.physics.walls import OutlineContacts, near_walls, stopped_by
 from swarmsim.site import Site
 from swarmsim.site.steps import StepAt
 from swarmsim.vehicles.skid_steer import SkidSteerParams, tyre_creep, tyre_sinkage, wheel_spacing
@@ -138,10 +138,12 @@ def _slide(
     return jnp.append((jnp.stack([start_x, start_y]) + change) / mass, turn), free + radius * pull / inertia
 
 
-def _with_faces(walls: Walls, params: SkidSteerParams, rotation: jax.Array, arm: jax.Array, step: StepAt) -> Walls:
+def _with_faces(
+    walls: OutlineContacts, params: SkidSteerParams, rotation: jax.Array, arm: jax.Array, step: StepAt
+) -> OutlineContacts:
     """``walls`` and the faces that are too high for the wheels at ``arm`` [4, 3] (world) from the centre of mass."""
     blocks = (step.rise_m > params.step_max_m) & (step.beyond_m < 0.0)
-    return Walls(
+    return OutlineContacts(
         clearance_m=jnp.concatenate([walls.clearance_m, jnp.where(blocks, _before_face(params, step), 1e3)]),
         outward=jnp.concatenate([walls.outward, -step.to_high]),
         arm_m=jnp.concatenate([walls.arm_m, arm[:, :2]]),

@@ -27,7 +27,7 @@ _NEXT = (1, 3, 0, 2)  # corner that follows each of front left, front right, rea
 
 
 @pytree
-class Walls:
+class OutlineContacts:
     """Points of the outline that can touch a wall: the four corners and the nearest point of each of the four sides."""
 
     clearance_m: jax.Array  # [8] distance to the wall along its normal, < 0 in the wall
@@ -35,7 +35,7 @@ class Walls:
     arm_m: jax.Array  # [8, 2] world, from the centre of mass
 
 
-def near_walls(params: SkidSteerParams, body: RigidState, rotation: jax.Array, site: Site) -> Walls:
+def near_walls(params: SkidSteerParams, body: RigidState, rotation: jax.Array, site: Site) -> OutlineContacts:
     """Contacts of the outline; ``rotation`` [3, 3]: body to world.
 
     The clearance along a side is convex where the wall is, so its least value is sought where tangents meet
@@ -60,7 +60,7 @@ def near_walls(params: SkidSteerParams, body: RigidState, rotation: jax.Array, s
         slope = jnp.where(falls, along, slope[0]), jnp.where(falls, slope[1], along)
     normal = jnp.concatenate([gradient, jnp.stack([side[:, 1], -side[:, 0]], axis=-1)])
     steepness = jnp.maximum(jnp.sqrt(jnp.sum(gradient * gradient, axis=-1) + 1e-12), STEEPNESS_MIN)
-    return Walls(
+    return OutlineContacts(
         clearance_m=jnp.concatenate([clearance / steepness, jnp.where(within, between, NOT_NEAR_M)]),
         outward=normal * jax.lax.rsqrt(jnp.sum(normal * normal, axis=-1, keepdims=True) + 1e-12),
         arm_m=jnp.concatenate([corner, arm]),
@@ -78,7 +78,7 @@ def _where_tangents_meet(
 
 
 def stopped_by(
-    walls: Walls, params: SkidSteerParams, velocity: jax.Array, yaw_rate: jax.Array, dt: float
+    walls: OutlineContacts, params: SkidSteerParams, velocity: jax.Array, yaw_rate: jax.Array, dt: float
 ) -> tuple[jax.Array, jax.Array]:
     """Velocity [2] (m/s, world) and yaw rate [] (rad/s, about the vertical) that enter no wall within ``dt`` seconds.
 
