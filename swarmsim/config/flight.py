@@ -39,11 +39,16 @@ class Fence(Failsafe):
 
 
 class WindFailsafe(Failsafe):
-    """For ``after_s``, more than a ``share`` of the largest tilt (as tangents) or rotor speed is used."""
+    """For ``after_s`` the air carries the vehicle off, faster than ``drift_m_s``, although it does nearly all it can.
+
+    Nearly all is a ``share`` of the largest tilt (as tangents) or rotor speed. A vehicle that only lags behind in a gust
+    flies on; at the fence it lands at once.
+    """
 
     action: Action = "land"
     share: float = Field(default=0.9, gt=0, le=1)
-    after_s: NonNegative = 2.0
+    drift_m_s: NonNegative = 1.0
+    after_s: NonNegative = 8.0
 
 
 class BatteryFailsafe(Failsafe):

@@ -28,12 +28,22 @@ RATE_INTEGRAL_1_S = 4.0 / 3.0
 against moments such as that of rotors in an air flow, above the centre of mass."""
 RATE_ERROR_MAX = 1.0
 """Rate error [rad/s] beyond which the integral grows no faster."""
+RATE_INTEGRAL_MAX = 2.0
+"""Largest integral of the rate error [rad/s]: PX4's MC_RR_INT_LIM 0.3 over MC_ROLLRATE_P 0.15. Where motors are full
+and yaw has to give way, it would grow for as long as that lasts."""
+DISTURBANCE_MAX_M_S2 = 2.0 * GRAVITY_M_S2
+"""Largest disturbance that is believed, horizontal and vertical: twice what holds at a tilt of 45 degrees, because in a
+strong wind the rotors also lose thrust, which the observer takes for a disturbance along their axes."""
+LEVEL_SHARE_MIN = 0.3
+"""Share of the full thrust that stays for going sideways when height needs all (PX4's MPC_THR_XY_MARG)."""
 CATCH_UP = 0.2
 """Share of the commanded speed by which a vehicle that has fallen behind may exceed its largest speed."""
+SETTLED_LIFT = 0.05
+"""Thrust over the weight once the feet touch in a landing."""
 LANDED_DESCENT_M_S = 0.2
 """Minimum commanded descent rate for landing detection."""
-LANDED_SPEED_M_S = 0.15
-"""Maximum speed for landing detection."""
+LANDED_SPEED_M_S, LANDED_SINK_M_S = 1.5, 0.25
+"""Largest horizontal and vertical speed for landing detection (PX4's defaults LNDMC_XY_VEL_MAX and LNDMC_Z_VEL_MAX)."""
 
 
 @pytree
@@ -80,11 +90,11 @@ def control(
     touching = state.ground_force_n > LANDED_LOAD * GRAVITY_M_S2 * autopilot.mass_kg
     attitude = rotation_matrix(body.quaternion)
     memory = _observed(autopilot, memory, body, attitude, touching, dt)
-    acceleration, stuck = _acceleration(autopilot, memory, body, touching, command, dt)
+    damping = autopilot.climb_damping_1_s * jnp.sum(attitude[:, 2] * body.velocity_m_s)
+    acceleration, stuck = _acceleration(autopilot, memory, body, touching, damping, command, dt)
     pull = acceleration + jnp.array([0.0, 0.0, GRAVITY_M_S2], acceleration.dtype)
     pull_body = to_body(attitude, pull)
     rate = _body_rate(autopilot, attitude, pull_body, command.yaw_rad)
-    damping = autopilot.climb_damping_1_s * jnp.sum(attitude[:, 2] * body.velocity_m_s)
     thrust = autopilot.mass_kg * jnp.maximum(pull_body[2] + damping, 0.0)
     if isinstance(command, PositionCommand):
         integral = _rate_integral(memory, body, rate, touching, dt)
@@ -111,6 +121,7 @@ def _rate_integral(
     """Integral [3] rad/s of the rate error over time, which starts anew on the ground."""
     error = rate - body.angular_velocity_rad_s
     grown = memory.rate_integral_rad_s + dt * RATE_INTEGRAL_1_S * jnp.clip(error, -RATE_ERROR_MAX, RATE_ERROR_MAX)
+    grown = jnp.clip(grown, -RATE_INTEGRAL_MAX, RATE_INTEGRAL_MAX)
     return jnp.where(touching | (memory.thrust_m_s2 <= 0.0), 0.0, grown)
 
 
@@ -144,10 +155,9 @@ def _observed(
     error = jnp.where(waits, 0.0, body.velocity_m_s - predicted)
     gain = autopilot.velocity_integral_1_s2
     found = memory.disturbance_m_s2 + dt * gain * error
-    most = autopilot.tilt_max_tan * GRAVITY_M_S2
     return replace(
         memory,
-        disturbance_m_s2=_limited(found, jnp.stack([most, most])),
+        disturbance_m_s2=_limited(found, (DISTURBANCE_MAX_M_S2, DISTURBANCE_MAX_M_S2)),
         velocity_m_s=jnp.where(waits, body.velocity_m_s, predicted + 2.0 * dt * jnp.sqrt(gain) * error),
     )
 
@@ -200,26 +210,47 @@ def _acceleration(
     memory: ControlMemory,
     body: RigidState,
     touching: jax.Array,
+    damping_m_s2: jax.Array,
     setpoint: MultirotorCommand | PositionCommand,
     dt: float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Wanted acceleration [3] m/s^2 (world) within the limits, and how long [] s the ground has stopped a descent."""
+    """Wanted acceleration [3] m/s^2 (world) within the limits, and how long [] s the ground has stopped a descent.
+
+    Height comes before place, as in PX4: going sideways has what the tilt and, of the full thrust, lifting leaves.
+    """
     offset = setpoint.position_m - body.position_m
     approach = setpoint.hold_position * _approach(autopilot, offset)
     fed = setpoint.velocity_m_s
-    limits = jnp.stack([autopilot.speed_max_m_s, autopilot.climb_rate_max_m_s])
     # Without room above the commanded velocity, what a vehicle has once fallen behind it never makes good.
-    pace = jnp.stack([jnp.sqrt(fed[0] * fed[0] + fed[1] * fed[1] + 1e-12), jnp.abs(fed[2])])
-    velocity = _limited(fed + approach, limits + CATCH_UP * jnp.minimum(pace, limits))
+    fastest, climb = autopilot.speed_max_m_s, autopilot.climb_rate_max_m_s
+    fastest += CATCH_UP * jnp.minimum(jnp.sqrt(fed[0] * fed[0] + fed[1] * fed[1] + 1e-12), fastest)
+    velocity = _limited(fed + approach, (fastest, climb + CATCH_UP * jnp.minimum(jnp.abs(fed[2]), climb)))
     reach = autopilot.acceleration_max_m_s2
     feedback = setpoint.acceleration_m_s2 + autopilot.velocity_gain_1_s * (velocity - body.velocity_m_s)
-    wanted = _limited(feedback, jnp.stack([reach, reach])) - memory.disturbance_m_s2
+    wanted = _limited(feedback, (reach, reach)) - memory.disturbance_m_s2
     lift = jnp.maximum(wanted[2], (LIFT_MIN - 1.0) * GRAVITY_M_S2)
-    level = _limited(wanted, jnp.stack([autopilot.tilt_max_tan * (GRAVITY_M_S2 + lift), reach]))
-    moves = body.velocity_m_s - fed * jnp.array([1.0, 1.0, 0.0])  # over what it is to land on
-    still = touching & (jnp.sum(moves * moves) < LANDED_SPEED_M_S**2)
+    # Feet on the ground in a landing: upright, and the weight on them, or the wind would tip it over (as PX4 does).
+    settles = (touching | (memory.stuck_s > 0.0)) & (velocity[2] < -LANDED_DESCENT_M_S)
+    lift = jnp.where(settles, (SETTLED_LIFT - 1.0) * GRAVITY_M_S2, lift)
+    sideways = _sideways(autopilot, GRAVITY_M_S2 + lift, damping_m_s2)
+    level = _limited(wanted, (jnp.where(settles, 0.0, sideways), reach))
+    east, north = body.velocity_m_s[0] - fed[0], body.velocity_m_s[1] - fed[1]  # over what it is to land on
+    still = touching & (east * east + north * north < LANDED_SPEED_M_S**2)
+    still &= jnp.abs(body.velocity_m_s[2]) < LANDED_SINK_M_S
     given = jnp.stack([level[0], level[1], lift])
     return given, _stuck(memory.stuck_s, velocity[2], still, dt)
+
+
+def _sideways(autopilot: ControlParams, up_m_s2: jax.Array, damping_m_s2: jax.Array) -> jax.Array:
+    """Largest horizontal part [] m/s^2 of a thrust over the mass whose vertical part is ``up_m_s2`` [].
+
+    ``damping_m_s2`` [] is what the thrust makes up for besides.
+    """
+    rotors, speed = autopilot.allocation.shape[0], autopilot.speed_max_rad_s
+    full = rotors * autopilot.thrust_coefficient_n_s2 * speed * speed / autopilot.mass_kg
+    full = jnp.maximum(full - damping_m_s2, GRAVITY_M_S2)
+    left = jnp.maximum(full * full - up_m_s2 * up_m_s2, (LEVEL_SHARE_MIN * full) ** 2)
+    return jnp.minimum(autopilot.tilt_max_tan * up_m_s2, jnp.sqrt(left))
 
 
 def _approach(autopilot: ControlParams, offset: jax.Array) -> jax.Array:
@@ -237,15 +268,19 @@ def _approach(autopilot: ControlParams, offset: jax.Array) -> jax.Array:
 def _stuck(stuck_s: jax.Array, climb_m_s: jax.Array, still: jax.Array, dt: float) -> jax.Array:
     """Time [] s for which the vehicle has stood ``still`` on the ground although ``climb_m_s`` [] commands a descent.
 
-    It starts again when the vehicle moves, unless it has landed already; a commanded climb clears it.
+    It runs back while the vehicle moves, hopping in a gust, unless it has landed already; a commanded climb clears it.
     """
-    longer = jnp.where((climb_m_s < -LANDED_DESCENT_M_S) & still, stuck_s + dt, 0.0)
+    longer = jnp.where(still, stuck_s + dt, jnp.maximum(stuck_s - dt, 0.0))
+    longer = jnp.where(climb_m_s < -LANDED_DESCENT_M_S, longer, 0.0)
     kept = jnp.where(stuck_s >= LANDED_AFTER_S, stuck_s, longer)
     return jnp.where(climb_m_s > LANDED_DESCENT_M_S, 0.0, kept)
 
 
-def _limited(v: jax.Array, limits: jax.Array) -> jax.Array:
-    """Vector ``v`` [3] with its horizontal length and its height held to ``limits`` [2]."""
+Limit = jax.Array | float
+
+
+def _limited(v: jax.Array, limits: tuple[Limit, Limit]) -> jax.Array:
+    """Vector ``v`` [3] with its horizontal length and its height held to the two ``limits``."""
     length = jnp.sqrt(v[0] * v[0] + v[1] * v[1] + 1e-12)
     share = jnp.minimum(1.0, limits[0] / length)
     return jnp.stack([share * v[0], share * v[1], jnp.clip(v[2], -limits[1], limits[1])])

@@ -110,6 +110,7 @@ def _failsafes(mission: Mission, site: Site) -> FailsafeRules:
         fence_high_m=_f32(end - margin),
         ceiling_m=_f32(rules.fence.ceiling_m if fence else NOWHERE_M),
         wind_share=_f32(rules.wind.share if wind else np.inf),
+        wind_drift_m_s=_f32(rules.wind.drift_m_s),
         wind_s=_f32(rules.wind.after_s),
         battery_low=_f32(rules.battery.charge if battery else -1.0),
         link_range_m=_f32(rules.link.range_m if link else np.inf),

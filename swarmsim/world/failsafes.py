@@ -18,12 +18,17 @@ REACTION_S = 0.4
 """Time until a vehicle brakes: it has to be judged, and to tilt."""
 ARRIVED_M = 1.5
 """Horizontal distance from home within which a returning vehicle descends."""
+LEASH_M = 3.0
+"""Largest distance from which a vehicle that holds or lands flies back to its place; least one that this is inside the
+fence."""
 CLIMBED_M = 1.0
 """Height below that of the return from which a vehicle sets out for home."""
 SLOW_BELOW_M = 5.0
 """Height above ground below which a vehicle descends slowly."""
 DESCENT_M_S, SLOW_DESCENT_M_S = 1.5, 0.6
 """Rates of descent: PX4's defaults MPC_Z_V_AUTO_DN and, near the ground, MPC_LAND_SPEED."""
+WIND_DESCENT_M_S = 3.0
+"""Rate of descent, as far as the vehicle may, out of a wind that carries it off: it is weaker near the ground."""
 
 
 @pytree
@@ -33,7 +38,8 @@ class FailsafeRules:
     fence_low_m: jax.Array  # [2] south-west corner of the fence, world
     fence_high_m: jax.Array  # [2] north-east corner
     ceiling_m: jax.Array  # [] above the terrain
-    wind_share: jax.Array  # [] of the largest tilt (as tangents) that the vehicle keeps
+    wind_share: jax.Array  # [] of the largest tilt (as tangents) or rotor speed from which it does nearly all it can
+    wind_drift_m_s: jax.Array  # [] and the air carries it off faster than this
     wind_s: jax.Array  # [] for how long
     battery_low: jax.Array  # [] charge left
     link_range_m: jax.Array  # [] from home, where the ground station is
@@ -49,7 +55,7 @@ class Rescue:
     takes_over: jax.Array  # [] bool
     position_m: jax.Array  # [3] world
     velocity_m_s: jax.Array  # [3] world
-    strained_s: jax.Array  # [] for how long the wind has been nearly too strong
+    carried_s: jax.Array  # [] for how long the wind has carried it off
     unheard_s: jax.Array  # [] for how long the link has been lost
 
 
@@ -60,35 +66,36 @@ def no_rescue() -> Rescue:
         takes_over=jnp.array(False),
         position_m=jnp.zeros(3),
         velocity_m_s=jnp.zeros(3),
-        strained_s=zero,
+        carried_s=zero,
         unheard_s=zero,
     )
 
 
 def failing(
     rules: FailsafeRules, rescue: Rescue, *, position_m: jax.Array, velocity_m_s: jax.Array, brake_m_s2: jax.Array,
-    above_m: jax.Array, strain: jax.Array, charge: jax.Array, home_m: jax.Array, dt: float,
+    above_m: jax.Array, carried_m_s: jax.Array, charge: jax.Array, home_m: jax.Array, dt: float,
 ) -> tuple[jax.Array, Rescue]:  # fmt: skip
     """Which failsafes [failsafes] set in for one vehicle in flight, and its timers.
 
     The fence is felt ahead: at the distance that braking by ``brake_m_s2`` [] takes. ``above_m`` [] is the height above
-    the terrain, ``strain`` [] the tilt's share of the largest, ``charge`` [] what is left of
-    the battery, ``home_m`` [2] where it started.
+    the terrain, ``carried_m_s`` [] the speed at which the wind carries it off, ``charge`` [] what is left of the
+    battery, ``home_m`` [2] where it started.
     """
     level = position_m[:2]
     stop = REACTION_S * velocity_m_s + 0.5 * velocity_m_s * jnp.abs(velocity_m_s) / brake_m_s2
     ahead, up = level + stop[:2], above_m + stop[2]
     outside = jnp.any((ahead < rules.fence_low_m) | (ahead > rules.fence_high_m)) | (up > rules.ceiling_m)
-    strained = jnp.where(strain > rules.wind_share, rescue.strained_s + dt, 0.0)
+    carried = jnp.where(carried_m_s > rules.wind_drift_m_s, rescue.carried_s + dt, 0.0)
     away = level - home_m
     far = jnp.sum(away * away) > rules.link_range_m * rules.link_range_m
     unheard = jnp.where(far, rescue.unheard_s + dt, 0.0)
-    found = jnp.stack([outside, strained > rules.wind_s, charge < rules.battery_low, far & (unheard > rules.link_s)])
+    blown = (carried > rules.wind_s) | (outside & (carried > 0.0))  # at the fence there is no time to wait
+    found = jnp.stack([outside, blown, charge < rules.battery_low, far & (unheard > rules.link_s)])
     return found, Rescue(
         takes_over=rescue.takes_over,
         position_m=rescue.position_m,
         velocity_m_s=rescue.velocity_m_s,
-        strained_s=strained,
+        carried_s=carried,
         unheard_s=unheard,
     )
 
@@ -105,10 +112,14 @@ def rescue_of(
     high = position_m[2] > rules.return_height_m - CLIMBED_M
     lands = (action == LAND) | ((action == RETURN) & there)
     cruises = (action == RETURN) & ~there
-    sink = jnp.where(height_m > SLOW_BELOW_M, DESCENT_M_S, SLOW_DESCENT_M_S)
-    # What has been flown to is kept while the vehicle holds or lands, so that the wind does not carry it away.
-    kept = jnp.where(rescue.takes_over, rescue.position_m[:2], position_m[:2])
-    inside = jnp.clip(kept, rules.fence_low_m, rules.fence_high_m)
+    blown = set_in[events.WIND - len(events.LOSSES)]
+    outside = jnp.any((position_m[:2] < rules.fence_low_m) | (position_m[:2] > rules.fence_high_m))
+    near = jnp.where(outside & blown, 0.0, SLOW_DESCENT_M_S)  # low above the ground it can fly back before it lands
+    sink = jnp.where(height_m > SLOW_BELOW_M, jnp.where(blown, WIND_DESCENT_M_S, DESCENT_M_S), near)
+    # The place is kept while the vehicle holds or lands; one that the wind carries off does not race back to it.
+    back = jnp.where(rescue.takes_over, rescue.position_m[:2] - position_m[:2], 0.0)
+    kept = position_m[:2] + back * jnp.minimum(1.0, LEASH_M * jax.lax.rsqrt(jnp.sum(back * back) + 1e-12))
+    inside = jnp.clip(kept, rules.fence_low_m + LEASH_M, rules.fence_high_m - LEASH_M)
     level = jnp.where((action == RETURN) & (there | high), home_m, inside)
     aim = jnp.where(cruises, jnp.maximum(rules.return_height_m, jnp.where(high, position_m[2], 0.0)), position_m[2])
     ground = sample(site.terrain_m, site, position_m[:2])
@@ -117,6 +128,6 @@ def rescue_of(
         takes_over=jnp.any(set_in),
         position_m=jnp.append(level, aim),
         velocity_m_s=jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.where(lands, -sink, 0.0)]),
-        strained_s=rescue.strained_s,
+        carried_s=rescue.carried_s,
         unheard_s=rescue.unheard_s,
     )

@@ -59,11 +59,12 @@ def record_events(
         flies = state.active & (height > AIRBORNE_M) & state.finite
         failing_now, rescue = failing(
             world.failsafes, rescue, position_m=body.position_m, velocity_m_s=body.velocity_m_s,
-            brake_m_s2=params.control.acceleration_max_m_s2, strain=kind.strain(params, state.vehicle),
+            brake_m_s2=params.control.acceleration_max_m_s2,
+            carried_m_s=kind.carried(params, state.vehicle, world.failsafes.wind_share),
             above_m=body.position_m[2] - sample(world.site.terrain_m, world.site, body.position_m[:2]),
             charge=1.0 - state.vehicle.energy_j / limits.battery_j, home_m=limits.home_m, dt=dt,
         )  # fmt: skip
-        failing_now = failing_now & flies & events.able(state.event_time_s) & ~jnp.any(lost)
+        failing_now = failing_now & flies & ~jnp.any(lost)  # one that returns may yet have to land
     happened = jnp.concatenate([lost, failing_now]) & state.active
     times = events.record(state.event_time_s, happened, now_s)
     active = state.active

@@ -39,8 +39,8 @@ class Kind(Protocol):
     def rescued(self, command: Any, rescue: Rescue) -> Any:
         """The command, or what the autopilot does by itself; of a kind that flies, as are the next two."""
 
-    def strain(self, params: Any, vehicle: Any) -> jax.Array:
-        """How much [] of what it can do against the wind it does."""
+    def carried(self, params: Any, vehicle: Any, share: jax.Array) -> jax.Array:
+        """Speed [] m/s at which the air carries it off although it does more than a ``share`` [] of what it can."""
 
     def landed(self, control: Any) -> jax.Array:
         """Whether [] it stands on the ground with its motors off."""

@@ -94,16 +94,20 @@ def rescued(command: Command, rescue: Rescue) -> Command:
     return replace(command, **changes)
 
 
-def strain(params: MultirotorParams, vehicle: MultirotorState) -> jax.Array:
-    """How near [] it is to the end of what it can do against the wind: 1 at the largest tilt, or with the motors full.
+def carried(params: MultirotorParams, vehicle: MultirotorState, share: jax.Array) -> jax.Array:
+    """Speed [] m/s at which the air carries it off although it does nearly all that it can; zero while it does less.
 
-    The larger of the tilt over the largest (as tangents) and the mean rotor speed over what the battery allows.
+    Nearly all is more than ``share`` [] of the largest tilt (as tangents) or of the rotor speed that the battery
+    allows. It is carried off when it moves against its own thrust: with the wind, or, its motors full, down.
     """
-    up = rotation_matrix(vehicle.body.quaternion)[:, 2]
+    up, velocity = rotation_matrix(vehicle.body.quaternion)[:, 2], vehicle.body.velocity_m_s
     level = jnp.sqrt(up[0] * up[0] + up[1] * up[1] + 1e-12)
-    tilt = level / (params.control.tilt_max_tan * jnp.maximum(up[2], 0.1))
-    share = jnp.minimum(1.0, vehicle.voltage_v / jnp.maximum(params.speed_max_voltage_v, 1e-3))
-    return jnp.maximum(tilt, jnp.mean(vehicle.rotor_speed_rad_s) / (share * params.speed_max_rad_s))
+    tilted = level > share * params.control.tilt_max_tan * jnp.maximum(up[2], 0.1)
+    volts = jnp.minimum(1.0, vehicle.voltage_v / jnp.maximum(params.speed_max_voltage_v, 1e-3))
+    full = jnp.mean(vehicle.rotor_speed_rad_s) > share * volts * params.speed_max_rad_s
+    back = -(up[0] * velocity[0] + up[1] * velocity[1]) / level
+    off = jnp.maximum(jnp.where(tilted | full, back, 0.0), jnp.where(full, -velocity[2], 0.0))
+    return jnp.maximum(off, 0.0)
 
 
 def landed(memory: ControlMemory) -> jax.Array:
@@ -140,15 +144,16 @@ def tick(
     step = make_multirotor_step(engine, dt, layout)
     speeds, memory = control(params, memory, vehicle, command, substeps * dt)
     speeds = jnp.where(armed, speeds, 0.0)
-    velocity = vehicle.body.velocity_m_s
+    velocity, stood = vehicle.body.velocity_m_s, vehicle.ground_force_n > 0.0
 
     def one(vehicle: MultirotorState, _: None) -> tuple[MultirotorState, None]:
         return step(params, vehicle, speeds, wind_m_s, ground, wall), None
 
     vehicle, _ = jax.lax.scan(one, vehicle, None, length=substeps)
     relative = velocity if ground.velocity_m_s is None else velocity - ground.velocity_m_s
-    before = jnp.sqrt(jnp.sum(relative * relative) + 1e-12)
-    return vehicle, memory, jnp.where(vehicle.ground_force_n > 0.0, before, 0.0)
+    meets = jnp.sqrt(jnp.sum(relative * relative) + 1e-12)
+    impact = jnp.where(stood, -jnp.sum(relative * ground.normal), meets)  # what slides over the ground hits nothing
+    return vehicle, memory, jnp.where(vehicle.ground_force_n > 0.0, impact, 0.0)
 
 
 def height(params: MultirotorParams, vehicle: MultirotorState, ground: Plane) -> jax.Array:

@@ -223,3 +223,28 @@ def test_one_that_circles_its_place_comes_to_it(name):
     body = replace(start.body, position_m=jnp.array([8.0, 0.0, 30.0]), velocity_m_s=jnp.array([0.0, 7.5, 0.0]))
     states, _, _ = fly_controlled(params, turn, 20.0, state=replace(start, body=body), name=name)
     np.testing.assert_allclose(states.body.position_m[-1], [0, 0, 30.0], atol=0.1)
+
+
+def stay(time):
+    zero = 0.0 * time
+    return PositionCommand(
+        position_m=jnp.stack([zero, zero, 20.0 + zero]),
+        velocity_m_s=jnp.zeros(3),
+        acceleration_m_s2=jnp.zeros(3),
+        yaw_rad=zero,
+    )
+
+
+@pytest.mark.parametrize(("name", "least_tilt_deg"), [("tarot_t650", 44.5), ("x500", 30.0)])
+def test_in_too_strong_a_wind_it_keeps_height_and_heading_and_drifts_steadily(name, least_tilt_deg):
+    params = params_of(name)
+    start = airborne(params, height=20.0, speed=hover_speed(params))
+    states, memory, _ = fly_controlled(params, stay, 20.0, state=start, wind=16.0, name=name)
+    late = states.body.velocity_m_s[-500:]
+    assert 1.0 < np.linalg.norm(late[-1, :2]) < 8.0
+    assert np.ptp(late, axis=0).max() < 0.1
+    np.testing.assert_allclose(states.body.position_m[-500:, 2], 20.0, atol=0.4)
+    up = attitude(states.body.quaternion[-500:])
+    assert np.degrees(np.arccos(up[:, 2, 2])).min() > least_tilt_deg  # it uses all it has
+    assert np.abs(np.arctan2(up[:, 1, 0], up[:, 0, 0])).max() < 0.2
+    assert np.abs(memory.rate_integral_rad_s[-1]).max() < 1.0
