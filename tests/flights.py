@@ -12,7 +12,7 @@ from swarmsim.config.vehicles import Multirotor
 from swarmsim.control.multirotor import control, control_start
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.multirotor import make_multirotor_step, rest_state
-from swarmsim.physics.wind import gust_noise, gust_start, gust_step, gust_velocity, steady_wind
+from swarmsim.physics.wind import GUST_NOISE, gust_start, gust_step, gust_velocity, steady_wind
 from swarmsim.vehicles.battery import open_circuit_voltage
 from swarmsim.vehicles.multirotor import MultirotorParams, multirotor_params
 from swarmsim.vehicles.state import MultirotorState, RigidState
@@ -103,13 +103,18 @@ def _controlled(params, state, ground, wind_m_s, seed, setpoint_at, name, engine
             key = jax.random.fold_in(jax.random.key(seed), k)
             airspeed = jnp.linalg.norm(wind - state.body.velocity_m_s)
             gust = gust_step(
-                gust_noise(key), gust, speed_m_s=wind_m_s, height_m=height, airspeed_m_s=airspeed, dt=2 * DT
+                jax.random.normal(key, (GUST_NOISE,)),
+                gust,
+                speed_m_s=wind_m_s,
+                height_m=height,
+                airspeed_m_s=airspeed,
+                dt=2 * DT,
             )
             wind = wind + gust_velocity(gust, wind_m_s, 4.2, height)
         state = step(params, step(params, state, command, wind, ground), command, wind, ground)
         return (state, memory, gust), (state, memory, command)
 
-    start = (state, control_start(), gust_start(jax.random.key(seed + 1000)))
+    start = (state, control_start(), gust_start(jax.random.normal(jax.random.key(seed + 1000), (GUST_NOISE,))))
     return jax.lax.scan(tick, start, jnp.arange(ticks))[1]
 
 

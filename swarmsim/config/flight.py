@@ -19,6 +19,8 @@ class FlightEffects(Model):
     translational_lift: bool = True
     ground_effect: bool = True
     battery_sag: bool = True
+    downwash: bool = True
+    motor_noise: bool = True
 
 
 Action = Literal["none", "hold", "return", "land"]
@@ -41,8 +43,8 @@ class Fence(Failsafe):
 class WindFailsafe(Failsafe):
     """For ``after_s`` the air carries the vehicle off, faster than ``drift_m_s``, although it does nearly all it can.
 
-    Nearly all is a ``share`` of the largest tilt (as tangents) or rotor speed. A vehicle that only lags behind in a gust
-    flies on; at the fence it lands at once.
+    Nearly all is a ``share`` of the largest tilt (as tangents) or rotor speed. A vehicle that only lags behind in a
+    gust flies on; at the fence it lands at once.
     """
 
     action: Action = "land"

@@ -89,8 +89,9 @@ class RotorModel(Model):
     The motor turns between ``speed_min_rad_s`` (idle) and ``speed_max_rad_s``, or stands still when it is disarmed;
     below ``speed_max_voltage_v`` at the battery the largest speed falls with the voltage. ``figure_of_merit`` is ideal
     over shaft power in hover. ``solidity`` (blade area over disc area) makes the thrust depend on the air's motion,
-    ``drag_kg`` and ``rolling_moment_kg_m`` are N and N m per rotor speed and speed across the rotor's axis; what is not
-    given is left out.
+    ``drag_kg`` and ``rolling_moment_kg_m`` are N and N m per rotor speed and speed across the rotor's axis,
+    ``speed_noise`` is the standard deviation of a rotor's speed about what is commanded, over it; what is not given is
+    left out.
     """
 
     thrust_coefficient_n_s2: Positive
@@ -106,6 +107,7 @@ class RotorModel(Model):
     solidity: Positive | None = None
     drag_kg: NonNegative | None = None
     rolling_moment_kg_m: NonNegative | None = None
+    speed_noise: Annotated[float, Field(ge=0, le=0.2)] | None = None
 
 
 class Feet(Model):

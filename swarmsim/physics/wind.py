@@ -1,4 +1,4 @@
-"""Wind near the ground: a steady profile and Dryden gusts, of one vehicle.
+"""Wind near the ground: a steady profile and Dryden gusts.
 
 Both follow MIL-F-8785C, "Military specification: flying qualities of piloted airplanes" (1980), sections 3.7.2 and
 3.7.3, low-altitude model. Its formulas are in feet; the functions here take and give SI.
@@ -21,6 +21,7 @@ AIRSPEED_MIN_M_S = 0.5
 
 GUST_NOISE = 5
 """Numbers of white noise that a step of the filters takes: one along the wind, two across, two up."""
+_WAVES = 4
 
 
 @pytree
@@ -57,15 +58,30 @@ def gust_scales(speed_m_s: jax.Array, height_m: jax.Array) -> tuple[jax.Array, j
     return jnp.stack([vertical / ratio**0.4, vertical]), jnp.stack([height / ratio**1.2, height])
 
 
-def gust_start(key: jax.Array) -> GustState:
-    """Filters in their steady state, so that gusts do not build up from calm."""
-    n = jax.random.normal(key, (5,))
-    return GustState(along=n[0], across=_steady(n[1:3]), vertical=_steady(n[3:5]))
+def gust_start(noise: jax.Array) -> GustState:
+    """Filters in their steady state, so that gusts do not build up from calm, from white ``noise`` [`GUST_NOISE`]."""
+    return GustState(along=noise[0], across=_steady(noise[1:3]), vertical=_steady(noise[3:5]))
 
 
-def gust_noise(key: jax.Array) -> jax.Array:
-    """White noise [`GUST_NOISE`] for one `gust_step`."""
-    return jax.random.normal(key, (GUST_NOISE,))
+def gust_noise(key: jax.Array, position_m: jax.Array, lengths_m: jax.Array) -> jax.Array:
+    """White noise [V, `GUST_NOISE`] in time for one `gust_step` of vehicles at ``position_m`` [V, 3], one key a step.
+
+    Each vehicle's is standard normal; that of two vehicles r apart has the correlation exp(-r / L), and so have their
+    gusts: that of the Dryden model along the line between them (MIL-F-8785C takes its spectra from it; across, it would
+    be (1 - r / 2 L) exp(-r / L)). L are the ``lengths_m`` [2] (horizontal, vertical) of `gust_scales`. Made of a few
+    waves of random length and direction (Rahimi and Recht, "Random features for large-scale kernel machines", 2007);
+    they are new at every step, so that the correlation over time is exact however few there are.
+    """
+    draws = jax.random.normal(key, (_WAVES, 4 + 2 * GUST_NOISE))
+    wave = draws[:, :3] / jnp.maximum(jnp.abs(draws[:, 3:4]), 1e-6)  # Cauchy: the spectrum of exp(-r)
+    turns = position_m @ wave.T
+    amplitude = draws[:, 4:].reshape(_WAVES, 2, GUST_NOISE) / _WAVES**0.5
+    level, up = turns / lengths_m[0], turns / lengths_m[1]
+
+    def sum_of(phase: jax.Array, part: slice) -> jax.Array:
+        return jnp.cos(phase) @ amplitude[:, 0, part] + jnp.sin(phase) @ amplitude[:, 1, part]
+
+    return jnp.concatenate([sum_of(level, slice(0, 3)), sum_of(up, slice(3, GUST_NOISE))], axis=-1)
 
 
 def gust_step(
@@ -75,7 +91,7 @@ def gust_step(
 
     White noise through the Dryden filters 1 / (1 + L s / V) along the wind and (1 + sqrt(3) L s / V) / (1 + L s / V)^2
     across and up, discretised exactly (matrix exponential and covariance over the step), so that the variance does not
-    depend on ``dt``. ``noise`` is that of `gust_noise`.
+    depend on ``dt``. ``noise`` [`GUST_NOISE`] is a row of `gust_noise`.
     """
     _, lengths = gust_scales(speed_m_s, height_m)
     passed = jnp.clip(jnp.maximum(airspeed_m_s, AIRSPEED_MIN_M_S) * dt / lengths, 0.0, 0.5)

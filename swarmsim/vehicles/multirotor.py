@@ -65,6 +65,8 @@ class MultirotorParams:
     speed_max_voltage_v: jax.Array  # [] V: below it the largest speed falls with the voltage
     rotor_inertia_kg_m2: jax.Array  # [] kg m^2, of one rotor about its axis
     rotor_air: RotorAir
+    downwash: jax.Array  # [] 1, or 0 to leave out what it does to those below
+    speed_noise: jax.Array  # [] standard deviation of a rotor's speed over what is commanded
     drag_quadratic_kg_m: jax.Array  # [3] N/(m/s)^2 along the body axes
     collision_radius_m: jax.Array  # [] m, of the upright cylinder around it
     contact_position_m: jax.Array  # [C, 3] m, body: the feet, then the rotor hubs (on which it lies when it has tipped)
@@ -98,6 +100,8 @@ def multirotor_params(spec: Multirotor, effects: FlightEffects | None = None) ->
         "rotor_inertia_kg_m2": rotor.inertia_kg_m2,
         "shaft_torque_nms2": rotor.thrust_coefficient_n_s2 * hover_induced(rotor) / rotor.figure_of_merit,
         "speed_max_voltage_v": rotor.speed_max_voltage_v if effects.battery_sag else 0.0,
+        "downwash": 1.0 if effects.downwash else 0.0,
+        "speed_noise": (rotor.speed_noise or 0.0) if effects.motor_noise else 0.0,
         "drag_quadratic_kg_m": np.broadcast_to(spec.drag_quadratic_kg_m, 3),
         "collision_radius_m": spec.collision_radius_m,
         "contact_position_m": contacts,

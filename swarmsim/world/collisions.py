@@ -30,6 +30,7 @@ class Bodies:
     radius_m: jax.Array  # [V]
     half_height_m: jax.Array  # [V]
     mass_kg: jax.Array  # [V] inf: does not give way
+    inertia_kg_m2: jax.Array  # [V] least moment of inertia about the centre of mass
     flies: jax.Array  # [V] bool: a rover stands on the ground, which takes vertical impulses
     active: jax.Array  # [V] bool: of two that are not, none moves
 
@@ -68,11 +69,13 @@ def collide(bodies: Bodies, near: Candidates, dt: float) -> Collisions:
     both_fly = bodies.flies[:, None] & of(bodies.flies)
     meets &= ~(upright & ~both_fly) & (bodies.active[:, None] | of(bodies.active))
     depth = jnp.where(inside, jnp.where(upright, tall - jnp.abs(at[..., 2]), reach - level), 0.0)
-    impulse = _impulses(bodies, near, meets, closing, normal, jnp.maximum(depth - TOUCH_M, 0.0))
+    radius, half = bodies.radius_m, bodies.half_height_m
+    arm = _arm(radius[:, None], half[:, None], of(half), at, normal, upright)
+    others = _arm(of(radius), of(half), half[:, None], -at, -normal, upright)
+    impulse = _impulses(bodies, near, meets, closing, normal, (arm, others), jnp.maximum(depth - TOUCH_M, 0.0))
     touched = meets & (jnp.sum(impulse * impulse, axis=-1) > 0.0)
     number = jnp.sum(touched, axis=1).astype(jnp.float32)
     impulse = impulse / jnp.maximum(jnp.maximum(number[:, None], of(number)), 1.0)[..., None]
-    arm = _arm(bodies, near, at, normal, upright)
     moves = jnp.isfinite(bodies.mass_kg)[:, None]
     return Collisions(
         velocity_m_s=jnp.sum(impulse, axis=1) / bodies.mass_kg[:, None],
@@ -117,26 +120,46 @@ def _normal(at: jax.Array, level: jax.Array, upright: jax.Array) -> jax.Array:
 
 
 def _impulses(
-    bodies: Bodies, near: Candidates, meets: jax.Array, closing: jax.Array, normal: jax.Array, depth: jax.Array
-) -> jax.Array:
-    """Impulse [V, C, 3] N s on each from each that it meets."""
-    inverse = 1.0 / bodies.mass_kg
-    effective = 1.0 / jnp.maximum(inverse[:, None] + near.of(inverse), 1e-9)
+    bodies: Bodies, near: Candidates, meets: jax.Array, closing: jax.Array, normal: jax.Array,
+    arms: tuple[jax.Array, jax.Array], depth: jax.Array,
+) -> jax.Array:  # fmt: skip
+    """Impulse [V, C, 3] N s on each from each that it meets, at the ``arms`` [V, C, 3] about both centres.
+
+    An impulse moves less than the masses because it also turns them: without that, spin would come from nowhere. It is
+    taken with the least moment of inertia, that of friction with the whole arm, so that no energy is gained.
+    """
+    of, fixed = near.of, ~jnp.isfinite(bodies.mass_kg)
+    inverse, turning = 1.0 / bodies.mass_kg, jnp.where(fixed, 0.0, 1.0 / bodies.inertia_kg_m2)
+
+    def effective_mass(mine: jax.Array, others: jax.Array) -> jax.Array:
+        """Of the pairs [V, C], from the squares [V, C] of the lever arms."""
+        gives = inverse[:, None] + turning[:, None] * mine + (of(inverse) + of(turning) * others)
+        return 1.0 / jnp.maximum(gives, 1e-9)
+
+    long = [jnp.sum(arm * arm, axis=-1) for arm in arms]
+    lever = [
+        jnp.maximum(whole - jnp.sum(arm * normal, axis=-1) ** 2, 0.0) for whole, arm in zip(long, arms, strict=True)
+    ]
+    effective = effective_mass(*lever)
     along = jnp.sum(closing * normal, axis=-1)
     wanted = jnp.minimum(PART_1_S * depth, PART_MAX_M_S)
     parting = wanted - jnp.where(along < 0.0, 1.0 + RESTITUTION, 1.0) * along
     push = jnp.where(meets, effective * jnp.maximum(parting, 0.0), 0.0)
     across = closing - along[..., None] * normal
     slip = norm(across)
-    rub = jnp.minimum(FRICTION * push, effective * slip) / jnp.maximum(slip, 1e-6)
+    rub = jnp.minimum(FRICTION * push, effective_mass(*long) * slip) / jnp.maximum(slip, 1e-6)
     return push[..., None] * normal - rub[..., None] * across
 
 
-def _arm(bodies: Bodies, near: Candidates, at: jax.Array, normal: jax.Array, upright: jax.Array) -> jax.Array:
-    """Place [V, C, 3] m where they touch, from the own centre: on the rim, in the middle of the heights they share."""
-    half, other = bodies.half_height_m[:, None], near.of(bodies.half_height_m)
+def _arm(
+    radius: jax.Array, half: jax.Array, other_half: jax.Array, at: jax.Array, normal: jax.Array, upright: jax.Array
+) -> jax.Array:
+    """Place [V, C, 3] m where two touch, from the centre of one: on its rim, in the middle of the heights they share.
+
+    ``radius`` and ``half`` are its own, ``at`` is its offset from the other one and ``normal`` points that way.
+    """
     middle = -at[..., 2]  # height of the other's centre over the own one
-    top, bottom = jnp.minimum(half, middle + other), jnp.maximum(-half, middle - other)
-    rim = -bodies.radius_m[:, None, None] * normal + 0.5 * (top + bottom)[..., None] * jnp.array([0.0, 0.0, 1.0])
+    top, bottom = jnp.minimum(half, middle + other_half), jnp.maximum(-half, middle - other_half)
+    rim = -radius[..., None] * normal + 0.5 * (top + bottom)[..., None] * jnp.array([0.0, 0.0, 1.0])
     face = -0.5 * at * jnp.array([1.0, 1.0, 0.0]) - half[..., None] * normal
     return jnp.where(upright[..., None], face, rim)

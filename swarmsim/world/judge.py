@@ -1,5 +1,6 @@
 """What judges vehicles, at a rate of its own: the ground below, the wind, the traffic, the radio, and events."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -7,21 +8,21 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim import randomness
-from swarmsim.physics.wind import GUST_NOISE, gust_noise, gust_step, gust_velocity, steady_wind
+from swarmsim.physics.wind import GUST_NOISE, gust_noise, gust_scales, gust_step, gust_velocity, steady_wind
 from swarmsim.scalars import over_vehicles
 from swarmsim.site import sample
 from swarmsim.world import events
-from swarmsim.world.collisions import Bodies, collide
 from swarmsim.world.decks import on_decks
 from swarmsim.world.failsafes import failing, rescue_of
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below, wall_beside
-from swarmsim.world.neighbours import DENSE_MAX, WINDOW, candidates, cleared, norm
 from swarmsim.world.radio import broadcast
-from swarmsim.world.right_of_way import kept_aside, reach_of, right_of_way
 from swarmsim.world.state import GroupState, Surroundings, WorldState
+from swarmsim.world.traffic import in_traffic
 
+MOTOR_NOISE_S = 0.1
+"""Correlation time of the errors of rotors' speeds: an estimate of how fast motor controllers hunt."""
 AIRBORNE_M = 0.5
 """Height of its feet above which a multirotor's failsafes are on."""
 
@@ -31,13 +32,13 @@ def look_around(world: World, state: WorldState, number: jax.Array) -> tuple[Wor
 
     ``number`` [] int32 is the judging period's, which gusts and the radio's losses are drawn for.
     """
-    gusts = randomness.consumer(state.key, "gusts")
+    lengths = gust_scales(world.air.speed_m_s, _flying_height(world, state.groups))[1]
     around = [
-        _refreshed(world, group, gusts, number, running, g)
+        _refreshed(world, group, state.key, number, lengths, running, g)
         for running, group, g in zip(state.clock.running, world.groups, state.groups, strict=True)
     ]
     groups = tuple(replace(g, around=new) for g, new in zip(state.groups, around, strict=True))
-    groups, collided, crowded = _in_traffic(world, on_decks(world, groups))
+    groups, collided, crowded = in_traffic(world, on_decks(world, groups), state.clock.running)
     state = replace(state, groups=groups, crowded=state.crowded | crowded)
     return replace(state, radio=broadcast(world, state, number)), collided
 
@@ -75,13 +76,26 @@ def record_events(
     return replace(state, event_time_s=times, around=around, active=active, impact_m_s=jnp.zeros_like(impact))
 
 
+def _flying_height(world: World, groups: tuple[GroupState, ...]) -> jax.Array:
+    """Mean height [] m above ground of what flies, which the scales of the gusts between them are taken for."""
+    heights = [g.around.height_m for group, g in zip(world.groups, groups, strict=True) if KINDS[group.kind].FLIES]
+    if not heights:
+        return jnp.zeros(())
+    height = jnp.concatenate(heights)
+    known = jnp.isfinite(height)
+    return jnp.sum(jnp.where(known, height, 0.0)) / jnp.maximum(jnp.sum(known), 1)
+
+
 def _refreshed(
-    world: World, group: Group, gusts: jax.Array, number: jax.Array, running: jax.Array, state: GroupState
-) -> Surroundings:
+    world: World, group: Group, key: jax.Array, number: jax.Array, lengths_m: jax.Array, running: jax.Array,
+    state: GroupState,
+) -> Surroundings:  # fmt: skip
     """What is around a group's vehicles, with ground, height and wind where they are now if it is running."""
     kind = KINDS[group.kind]
 
-    def anew(noise: jax.Array | None, params: Any, limits: Limits, vehicle: Any, around: Surroundings) -> Surroundings:
+    period = world.timing.judge_period_s
+
+    def anew(noise: Any, params: Any, limits: Limits, vehicle: Any, around: Surroundings) -> Surroundings:
         body = vehicle.body
         ground = ground_below(world.site, body.position_m)
         height = kind.height(params, vehicle, ground)
@@ -94,77 +108,28 @@ def _refreshed(
         through = body.velocity_m_s - steady
         airspeed = jnp.sqrt(jnp.sum(through * through) + 1e-12)
         gust = gust_step(
-            noise, around.gust, speed_m_s=air.speed_m_s, height_m=above, airspeed_m_s=airspeed,
-            dt=world.timing.judge_period_s,
-        )  # fmt: skip
+            noise[0], around.gust, speed_m_s=air.speed_m_s, height_m=above, airspeed_m_s=airspeed, dt=period
+        )
+        assert around.motor_noise is not None
+        kept = math.exp(-period / MOTOR_NOISE_S)
+        motors = kept * around.motor_noise + math.sqrt(1.0 - kept * kept) * noise[1]
         wind = steady + air.gusts * gust_velocity(gust, air.speed_m_s, air.from_rad, above)
-        return replace(around, ground=ground, wall=wall, height_m=height, gust=gust, wind_m_s=wind)
+        return replace(around, ground=ground, wall=wall, height_m=height, gust=gust, wind_m_s=wind, motor_noise=motors)
 
-    def one(noise: jax.Array | None, params: Any, limits: Limits, vehicle: Any, around: Surroundings) -> Surroundings:
+    def one(noise: Any, params: Any, limits: Limits, vehicle: Any, around: Surroundings) -> Surroundings:
         return jax.lax.cond(running, anew, lambda *given: given[-1], noise, params, limits, vehicle, around)
 
-    def draw() -> jax.Array:
-        return jax.vmap(gust_noise)(randomness.per_vehicle(gusts, number, group.member))
+    def draw() -> tuple[jax.Array, jax.Array]:
+        gusts = jax.random.fold_in(randomness.consumer(key, "gusts"), number)
+        motors = randomness.per_vehicle(randomness.consumer(key, "motors"), number, group.member)
+        return (
+            gust_noise(gusts, state.vehicle.body.position_m, lengths_m),
+            jax.vmap(lambda k: jax.random.normal(k, (rotors,)))(motors),
+        )
 
-    noise = jax.lax.cond(running, draw, lambda: jnp.zeros((group.size, GUST_NOISE))) if kind.FLIES else None
+    rotors = kind.rotors(group.params) if kind.FLIES else 0
+    none = jnp.zeros((group.size, GUST_NOISE)), jnp.zeros((group.size, rotors))
+    noise = jax.lax.cond(running, draw, lambda: none) if kind.FLIES else None
     every = over_vehicles(one, layout=world.layout, unroll=1)
     refreshed: Surroundings = every(noise, group.params, group.limits, state.vehicle, state.around)
     return refreshed
-
-
-def _in_traffic(
-    world: World, groups: tuple[GroupState, ...]
-) -> tuple[tuple[GroupState, ...], list[jax.Array], jax.Array]:
-    """Groups after collisions, with what others ask of each; who has collided [U]; whether the search overflowed."""
-    flies = jnp.concatenate([jnp.full(group.size, KINDS[group.kind].FLIES) for group in world.groups])
-    active = jnp.concatenate([g.active for g in groups])
-    able = active & jnp.concatenate([events.intact(g.event_time_s) for g in groups])
-    height = jnp.concatenate([g.around.height_m for g in groups])
-    position = jnp.concatenate([g.vehicle.body.position_m for g in groups])
-    velocity = jnp.concatenate([g.vehicle.body.velocity_m_s for g in groups])
-    radius = jnp.concatenate([group.limits.radius_m for group in world.groups])
-    half_height = jnp.concatenate([group.limits.half_height_m for group in world.groups])
-    rules, dt = world.traffic, world.timing.judge_period_s
-    place, usable = cleared(jnp.where(jnp.isfinite(velocity), position, jnp.inf))
-    pace = jnp.where(usable[:, None], velocity, 0.0)
-    reach = reach_of(usable, radius, jnp.where(flies, rules.separation_m, rules.ground_separation_m))
-    near = candidates(place, usable, usable, reach + 2.0 * dt * jnp.max(norm(pace)), WINDOW, DENSE_MAX)
-    traffic = right_of_way(
-        position,
-        velocity,
-        height_m=height,
-        flies=flies,
-        active=able,
-        rank=jnp.concatenate([group.member for group in world.groups]),
-        radius_m=radius,
-        half_height_m=half_height,
-        separation_m=rules.separation_m,
-        ground_separation_m=rules.ground_separation_m,
-        held=jnp.concatenate([g.around.hold for g in groups]),
-        near=near,
-    )
-    mass = jnp.concatenate([group.params.mass_kg for group in world.groups])
-    bodies = Bodies(
-        position_m=place,
-        velocity_m_s=pace,
-        radius_m=radius,
-        half_height_m=half_height,
-        mass_kg=jnp.where(active, mass, jnp.inf),
-        flies=flies,
-        active=active,
-    )
-    met = collide(bodies, near, dt)
-    before = jnp.concatenate([g.around.push_m for g in groups])
-    push, aside = kept_aside(before, traffic.push_m, height, flies, rules.separation_m, dt)
-    hold = traffic.hold | aside
-    told, collided, first = [], [], 0
-    for group, g in zip(world.groups, groups, strict=True):
-        part = slice(first, first + group.size)
-        around = replace(g.around, hold=hold[part], push_m=push[part], nearest_m=traffic.nearest_m[part])
-        knocked = jax.vmap(KINDS[group.kind].knocked)(
-            group.params, g.vehicle, met.velocity_m_s[part], met.spin_nms[part]
-        )
-        told.append(replace(g, around=around, vehicle=knocked))
-        collided.append(met.hit[part] & active[part])
-        first += group.size
-    return tuple(told), collided, traffic.overflow

@@ -30,9 +30,16 @@ class Kind(Protocol):
     def stay(self, params: Any, vehicle: Any) -> Any:
         """The command that keeps the vehicle where it is."""
 
+    def jet(self, params: Any, vehicle: Any) -> tuple[jax.Array, jax.Array]:
+        """Thrust [] N with which it blows at those below it, and the distance [] m of its opposite motors."""
+
+    def rotors(self, params: Any) -> int:
+        """How many rotors it has; of a kind that flies."""
+
     def tick(
         self, params: Any, vehicle: Any, control: Any, command: Any, armed: jax.Array, ground: Plane,
-        wall: Plane, wind_m_s: jax.Array, site: Site, *, engine: str, dt: float, substeps: int, layout: Layout,
+        wall: Plane, wind_m_s: jax.Array, motor_noise: jax.Array | None, site: Site, *, engine: str, dt: float,
+        substeps: int, layout: Layout,
     ) -> tuple[Any, Any, jax.Array]:  # fmt: skip
         """Vehicle, controller and impact speed [] after one control period; ``layout`` is how it is mapped."""
 

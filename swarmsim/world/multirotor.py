@@ -115,6 +115,18 @@ def landed(memory: ControlMemory) -> jax.Array:
     return is_landed(memory)
 
 
+def rotors(params: MultirotorParams) -> int:
+    """How many rotors it has."""
+    return int(params.rotor_spin.shape[-1])
+
+
+def jet(params: MultirotorParams, vehicle: MultirotorState) -> tuple[jax.Array, jax.Array]:
+    """Thrust [] N with which it blows at those below it, and the distance [] m of its opposite motors."""
+    thrust = params.thrust_coefficient_n_s2 * jnp.sum(vehicle.rotor_speed_rad_s**2)
+    arm = jnp.max(jnp.sum(params.rotor_position_m[:, :2] ** 2, axis=-1))
+    return params.downwash * thrust, 2.0 * jnp.sqrt(arm)
+
+
 def knocked(params: MultirotorParams, vehicle: MultirotorState, velocity_m_s: jax.Array, spin_nms: jax.Array) -> Any:
     """The vehicle after a change of its velocity [3] and an angular impulse [3] N m s, both world."""
     body = vehicle.body
@@ -133,6 +145,7 @@ def tick(
     ground: Plane,
     wall: Plane,
     wind_m_s: jax.Array,
+    motor_noise: jax.Array,
     site: Site,
     *,
     engine: Any,
@@ -143,7 +156,7 @@ def tick(
     """Vehicle, controller and impact speed [] after one control period; rotors that are not ``armed`` run down."""
     step = make_multirotor_step(engine, dt, layout)
     speeds, memory = control(params, memory, vehicle, command, substeps * dt)
-    speeds = jnp.where(armed, speeds, 0.0)
+    speeds = jnp.where(armed, speeds * (1.0 + params.speed_noise * motor_noise), 0.0)
     velocity, stood = vehicle.body.velocity_m_s, vehicle.ground_force_n > 0.0
 
     def one(vehicle: MultirotorState, _: None) -> tuple[MultirotorState, None]:

@@ -42,6 +42,11 @@ def stay(params: SkidSteerParams, vehicle: SkidSteerState) -> SkidSteerCommand:
     return skid_steer_command(DriveCommand(speed_m_s=jnp.zeros(()), yaw_rate_rad_s=jnp.zeros(())))
 
 
+def jet(params: SkidSteerParams, vehicle: SkidSteerState) -> tuple[jax.Array, jax.Array]:
+    """It has no rotors."""
+    return jnp.zeros(()), jnp.zeros(())
+
+
 def tick(
     params: SkidSteerParams,
     vehicle: SkidSteerState,
@@ -51,6 +56,7 @@ def tick(
     ground: Plane,
     wall: Plane,
     wind_m_s: jax.Array,
+    motor_noise: None,
     site: Site,
     *,
     engine: Any,

@@ -29,6 +29,7 @@ class Surroundings:
     wall: Plane  # upright plane of the nearest wall at its height; far away where there is none
     wind_m_s: jax.Array  # [U, 3] velocity of the air, world
     gust: GustState
+    motor_noise: jax.Array | None  # [U, R] unit variance: errors of the rotors' speeds; None for what has no rotors
     height_m: jax.Array  # [U] of the lowest contact point above the ground
     hold: jax.Array  # [U] bool: another vehicle has the right of way
     push_m: jax.Array  # [U, 3] displacement that keeps apart from it, world

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim import randomness
-from swarmsim.physics.wind import gust_start
+from swarmsim.physics.wind import gust_noise, gust_scales, gust_start
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import counter_start
@@ -45,12 +45,14 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
     vehicle = jax.vmap(kind.rest, in_axes=(0, None, 0, 0))(group.params, world.site, group.start_m, group.yaw_rad)
     position = vehicle.body.position_m
     size = group.size
-    gust_keys = randomness.per_vehicle(randomness.consumer(key, "gust start"), jnp.int32(0), group.member)
+    noise = gust_noise(randomness.consumer(key, "gust start"), position, gust_scales(jnp.zeros(()), jnp.zeros(()))[1])
+    motors = (size, kind.rotors(group.params)) if kind.FLIES else None
     around = Surroundings(
         ground=jax.vmap(ground_below, in_axes=(None, 0))(world.site, position),
         wall=jax.vmap(partial(wall_beside, world.site, world.walls))(position, group.limits.half_height_m),
         wind_m_s=jnp.zeros((size, 3)),
-        gust=jax.vmap(gust_start)(gust_keys),
+        gust=jax.vmap(gust_start)(noise),
+        motor_noise=jnp.zeros(motors) if motors else None,
         height_m=jnp.zeros(size),
         hold=jnp.zeros(size, bool),
         push_m=jnp.zeros((size, 3)),
@@ -165,7 +167,7 @@ def move(world: World, kind: str, params: Any, state: GroupState, command: Any) 
         command = KINDS[kind].rescued(command, state.around.rescue)
     vehicle, control, impact = KINDS[kind].tick(
         params, state.vehicle, state.control, command, armed, state.around.ground, state.around.wall,
-        state.around.wind_m_s, world.site,
+        state.around.wind_m_s, state.around.motor_noise, world.site,
         engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps, layout=world.layout,
     )  # fmt: skip
     total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))

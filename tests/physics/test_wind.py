@@ -33,21 +33,46 @@ def test_gust_scales_of_the_specification():
     np.testing.assert_allclose(length, [100 * FOOT / ratio**1.2, 100 * FOOT], rtol=1e-5)
 
 
+def noise_of(key):
+    return jax.random.normal(key, (wind.GUST_NOISE,))
+
+
 def _series(dt, steps, batch, airspeed, height, speed=10.0):
     """Gust components [steps, batch, 3] in the wind's axes, divided by their standard deviations."""
     keys = jax.random.split(jax.random.key(3), batch)
 
     def one(key):
         def body(state, k):
-            noise = wind.gust_noise(jax.random.fold_in(key, k))
+            noise = noise_of(jax.random.fold_in(key, k))
             state = wind.gust_step(noise, state, speed_m_s=speed, height_m=height, airspeed_m_s=airspeed, dt=dt)
             return state, wind.gust_velocity(state, speed, jnp.pi * 1.5, height)  # blows to the east: u is x
 
-        return jax.lax.scan(body, wind.gust_start(jax.random.fold_in(key, 10**6)), jnp.arange(steps))[1]
+        return jax.lax.scan(body, wind.gust_start(noise_of(jax.random.fold_in(key, 10**6))), jnp.arange(steps))[1]
 
     (horizontal, vertical), lengths = wind.gust_scales(speed, height)
     series = np.asarray(jax.jit(jax.vmap(one, out_axes=1))(keys), np.float64)
     return series / np.array([horizontal, horizontal, vertical]), np.asarray(lengths, np.float64)
+
+
+def test_gusts_of_near_vehicles_are_correlated_as_the_dryden_model_says():
+    """Along the line between them: exp(-r / L), for whichever direction; each by itself is as before."""
+    lengths = np.array([60.0, 20.0])
+    place = np.array([[0, 0, 0], [10, 0, 0], [0, 0, 20], [40, 40, 0], [600.0, 0, 0]])
+
+    def body(state, key):
+        noise = wind.gust_noise(key, jnp.asarray(place, jnp.float32), jnp.asarray(lengths, jnp.float32))
+        return state, noise
+
+    _, noise = jax.jit(lambda k: jax.lax.scan(body, 0, k))(jax.random.split(jax.random.key(8), 60_000))
+    noise = np.asarray(noise, np.float64)
+    np.testing.assert_allclose(noise.mean(0), 0.0, atol=0.02)
+    np.testing.assert_allclose(noise.var(0), 1.0, atol=0.03)
+    apart = np.linalg.norm(place[:, None] - place[None], axis=-1)
+    for part, length in ((slice(0, 3), lengths[0]), (slice(3, 5), lengths[1])):
+        found = np.einsum("tik,tjk->ij", noise[..., part], noise[..., part]) / noise[..., part][:, 0].size
+        np.testing.assert_allclose(found, np.exp(-apart / length), atol=0.02)
+    between = np.einsum("tik,til->kl", noise, noise) / noise[..., 0].size
+    np.testing.assert_allclose(between, np.eye(5), atol=0.02)
 
 
 def test_gusts_have_the_dryden_variance_and_correlation():
@@ -78,9 +103,9 @@ def test_second_order_filter_is_discretised_exactly(passed):
 
 
 def test_gusts_are_keyed_and_die_in_calm():
-    start = wind.gust_start(jax.random.key(1))
+    start = wind.gust_start(noise_of(jax.random.key(1)))
     step = lambda key: wind.gust_step(  # noqa: E731 - one call, three keys
-        wind.gust_noise(jax.random.key(key)), start, speed_m_s=5.0, height_m=20.0, airspeed_m_s=5.0, dt=0.01
+        noise_of(jax.random.key(key)), start, speed_m_s=5.0, height_m=20.0, airspeed_m_s=5.0, dt=0.01
     )
     same, other = step(1), step(2)
     np.testing.assert_array_equal(step(1).across, same.across)

@@ -17,6 +17,9 @@ RADIUS_M = 0.386
 HALF_M = 0.15
 
 
+INERTIA = 0.02
+
+
 def bodies(position, velocity, mass=None, flies=None, active=None):
     count = len(position)
     return Bodies(
@@ -24,6 +27,7 @@ def bodies(position, velocity, mass=None, flies=None, active=None):
         velocity_m_s=jnp.asarray(velocity, jnp.float32),
         radius_m=jnp.full(count, 0.4),
         half_height_m=jnp.full(count, HALF_M),
+        inertia_kg_m2=jnp.full(count, INERTIA),
         mass_kg=jnp.asarray(np.ones(count) if mass is None else mass, jnp.float32),
         flies=jnp.asarray(np.ones(count, bool) if flies is None else flies),
         active=jnp.asarray(np.ones(count, bool) if active is None else active),
@@ -50,6 +54,7 @@ def test_momentum_is_conserved_and_nobody_gains_energy(dense_max):
         assert np.abs(change.sum(0)).max() < 1e-5 * max(scale, 1.0)
         after = speed + np.asarray(result.velocity_m_s)
         gained = 0.5 * (mass * ((after**2).sum(1) - (speed**2).sum(1))).sum()
+        gained += 0.5 * (np.asarray(result.spin_nms, float) ** 2).sum() / INERTIA
         pushed = 0.5 * (mass * 1.0**2).sum()  # those that overlap to begin with are moved apart
         assert gained < pushed
         touched += int(np.asarray(result.hit).sum())
