@@ -29,7 +29,8 @@ LEG_M, LEGS = 12.0, 4  # of a route
 BEND_DEG = (30.0, 75.0)  # turns between the legs, alternately to both sides
 FAR_M = (6.0, 25.0)  # from the rover to where the UAV starts
 STAYS_S = 5.0  # after the touchdown
-CONTACT_M = 0.02  # feet lower than this above the deck touch it
+CONTACT_M = 0.02  # feet lower than this above the deck touch it ...
+BELOW_M = 0.05  # ... and no lower below it than this
 BAR = 0.95  # share of the missions that is to succeed
 
 app = App(name="land_on", help=__doc__, help_format="plaintext")
@@ -77,7 +78,7 @@ def judge(record: swarmsim.MissionRecord, deck: Deck) -> dict[str, Any]:
     middle, axes, velocity = _carried(rover, time, deck.height_m)
     apart = np.einsum("tij,ti->tj", axes, uav.position_m - middle)  # along, across and above the deck
     feet = apart[:, 2] + deck.feet_m[:, 2].min()
-    on = (feet < CONTACT_M) & (np.abs(apart[:, :2]) < deck.half_m).all(axis=1)
+    on = (feet < CONTACT_M) & (feet > -BELOW_M) & (np.abs(apart[:, :2]) < deck.half_m).all(axis=1)
     done = [e.time_s for e in record.events if e.vehicle == uav.name and e.kind == "finished"]
     bad = sorted({f"{e.vehicle}: {e.kind}" for e in record.events if e.kind in events.KINDS})
     row: dict[str, Any] = {"seed": record.seed, "bends": bool(record.seed % 2), "events": ", ".join(bad)}
@@ -93,8 +94,9 @@ def judge(record: swarmsim.MissionRecord, deck: Deck) -> dict[str, Any]:
         return row
     slip = uav.velocity_m_s[touch - 1] - velocity[touch - 1]
     turned = np.einsum("tij,ti->tj", axes[[touch]], _axes(uav.quaternion[[touch]])[:, :, 0])[0]
-    low = np.flatnonzero(feet[:touch] < 1.0)
-    rises = int(np.sum(np.diff((feet[low[0] : touch] > 1.5).astype(int)) > 0)) if len(low) else 0
+    high = np.flatnonzero(feet[:touch] > 1.5)
+    low = feet[high[0] : touch] < 1.0 if len(high) else np.zeros(0, bool)
+    descents = int(np.sum(np.diff(low.astype(int)) > 0))
     row |= {
         "stays": later < len(time) and bool(on[touch : later + 1].all()),
         "touchdown_s": float(time[touch]),
@@ -107,7 +109,7 @@ def judge(record: swarmsim.MissionRecord, deck: Deck) -> dict[str, Any]:
         "sink_m_s": float(-slip[2]),
         "rover_m_s": float(np.linalg.norm(velocity[touch - 1, :2])),
         "contacts": int(np.sum(np.diff(on[: touch + 1].astype(int)) > 0)),
-        "go_arounds": rises,
+        "go_arounds": max(descents - 1, 0),
     }
     row["success"] = row["landed"] and row["stays"] and not bad
     return row

@@ -85,7 +85,7 @@ def shared_belief(plan: Plan, belief: Any) -> Belief | None:
 def heard_by(world: World, state: WorldState, number: int) -> Heard | None:
     """What the vehicles [U] of a group heard."""
     first = sum(group.size for group in world.groups[:number])
-    return heard(world, state.radio, first, world.groups[number].size)
+    return heard(world, state.radio, state.clock.tick, first, world.groups[number].size)
 
 
 def views(world: World, plan: Plan, state: WorldState, belief: Any) -> tuple[View, ...]:

@@ -23,15 +23,17 @@ NEVER_S = -1e6  # when a rover that was never heard was heard
 TURN_S = 0.25  # time constant of the rover's estimated acceleration
 ACCELERATION_MAX_M_S2 = 2.0  # a larger estimate is an error
 
-CONE = 0.35  # the offset that is allowed grows by so much for each metre of height above the deck
+CONE = 0.15  # the offset that is allowed grows by so much for each metre of height above the deck
+INSIDE = 0.8  # share of the room between feet and edge that is used on the deck
+LEAST_M = 0.02  # offset that is always allowed
 BEGINS, ENDS = 0.7, 1.4  # share of the allowed offset below which a descent begins, and from which it is broken off
-SLOWS = 0.6  # from this share on the descent is slower, and halts where all of it is used
+SLOWS = 0.35  # from this share on the descent is slower; it halts where all of it is used, and beyond that turns
 DRIFT_M_S = 0.4  # speed over the deck that is allowed, and ...
 DRIFT_1_S = 0.3  # ... how much more of it for each metre of height
 NEAR_GAIN = 1.3  # above the deck the offset is corrected faster than elsewhere
 
-FLARE_M = 0.5  # below this height above the deck the descent is that of the touchdown, above it grows ...
-FLARE_1_S = 0.8  # ... by so much for each metre
+FLARE_M = 0.7  # below this height above the deck the descent is that of the touchdown, above it grows ...
+FLARE_1_S = 0.6  # ... by so much for each metre
 TOUCH_M = 0.03  # feet lower than this above the deck touch it
 TOUCHED_LOW_M = 0.2  # of a rover's height, so much may be wrong
 PRESS_M_S = 1.5  # commanded descent on the deck: it unloads the rotors, so that the feet grip
@@ -194,7 +196,8 @@ def _seen(task: Task, carrier: Carrier, view: View) -> _Sight:
     above = view.position_m[2] + jnp.min(params.contact_position_m[:, 2]) - top
     cosine, sine = jnp.cos(carrier.yaw_rad), jnp.sin(carrier.yaw_rad)
     in_deck = jnp.abs(jnp.stack([cosine * offset[0] + sine * offset[1], cosine * offset[1] - sine * offset[0]]))
-    spare = jnp.maximum(deck.half_m - _feet(params, yaw_of(view.quaternion) - carrier.yaw_rad), 0.02)
+    room = deck.half_m - _feet(params, yaw_of(view.quaternion) - carrier.yaw_rad)
+    spare = jnp.maximum(INSIDE * room, LEAST_M)
     now = jnp.append(velocity[:2] + ahead * turned, velocity[2])
     return _Sight(
         offset_m=offset,
@@ -259,25 +262,26 @@ def _command(task: Task, memory: Landing, sight: _Sight, view: View, stands: jax
     # one that is beside the rover, or still on the ground, rises first
     risen = jnp.clip(jnp.minimum(sight.above_m, view.height_m) / RISEN_M, 0.0, 1.0)
     risen = jnp.where(risen > 0.5, 2.0 * risen - 1.0, 0.0)
-    pace = jnp.where(memory.descends | stands, 1.0, jnp.where(near & (sight.above_m > 0.0), 1.0, risen) * blocked)
-    pace = jnp.where(waits & ~stands, 0.0, pace)
+    pace = jnp.where(memory.descends, 1.0, jnp.where(near & (sight.above_m > 0.0), 1.0, risen) * blocked)
+    pace = jnp.where(waits | stands, 0.0, pace)
     step = sight.offset_m * jnp.minimum(1.0, _reach(control, settings.speed_m_s) / distance)
     step = jnp.where(near, NEAR_GAIN, 1.0) * pace * step
     follow = jnp.where(sight.fresh, pace, 0.0)
     rise = control.position_gain_1_s * jnp.maximum(settings.altitude_m - sight.above_m, over)
     climb = jnp.clip(rise, -settings.descent_speed_m_s, settings.climb_speed_m_s)
     down = settings.touchdown_speed_m_s + FLARE_1_S * jnp.maximum(sight.above_m - FLARE_M, 0.0)
-    down = jnp.minimum(down, settings.descent_speed_m_s) * jnp.clip((1.0 - sight.share) / (1.0 - SLOWS), 0.0, 1.0)
+    down = jnp.minimum(down, settings.descent_speed_m_s) * jnp.clip((1.0 - sight.share) / (1.0 - SLOWS), -1.0, 1.0)
     rate = jnp.where(memory.descends, -down, climb) + jnp.where(near, follow, 0.0) * sight.velocity_m_s[2]
     rate = jnp.where(waits, 0.0, rate)
     rate = jnp.where(stands, -PRESS_M_S, rate)
-    level = jnp.where(stands, 1.0, follow) * sight.velocity_m_s[:2]
+    # on the deck it moves as the deck does, whatever was heard of that: nothing but its own velocity is commanded
+    level = jnp.where(stands, view.velocity_m_s[:2], follow * sight.velocity_m_s[:2])
     push = jnp.where(low | stands, 0.0, view.push_m)
     place = view.position_m + jnp.append(step, 0.0) + push
     return PositionCommand(
         position_m=jnp.where(sight.known | stands, place, memory.place_m),
         velocity_m_s=jnp.append(level, rate),
-        acceleration_m_s2=jnp.append(jnp.where(stands, 1.0, follow) * sight.acceleration_m_s2, 0.0),
+        acceleration_m_s2=jnp.append(jnp.where(stands, 0.0, follow) * sight.acceleration_m_s2, 0.0),
         yaw_rad=jnp.where(sight.known, _along(view, sight.yaw_rad), task.yaw_rad),
         hold_position=jnp.ones(()),
     )

@@ -38,6 +38,7 @@ def radio_start(world: World, groups: tuple[GroupState, ...]) -> RadioState:
         velocity_m_s=jnp.zeros((slots, vehicles, 3)),
         yaw_rad=jnp.broadcast_to(yaw, (slots, vehicles)),
         count_rate_cps=jnp.zeros((slots, vehicles)),
+        tick=jnp.int32(0),
         heard_index=jnp.zeros((vehicles, mates), jnp.int32),
         heard=jnp.zeros((vehicles, mates), bool),
     )
@@ -58,6 +59,7 @@ def broadcast(world: World, state: WorldState, number: jax.Array) -> RadioState:
         velocity_m_s=_pushed(radio.velocity_m_s, jnp.concatenate([b.velocity_m_s for b in bodies])),
         yaw_rad=_pushed(radio.yaw_rad, _yaw(state.groups)),
         count_rate_cps=_pushed(radio.count_rate_cps, jnp.concatenate(rates)),
+        tick=state.clock.tick,
         heard_index=radio.heard_index,
         heard=radio.heard,
     )
@@ -76,8 +78,11 @@ def _pushed(slots: jax.Array, value: jax.Array) -> jax.Array:
     return jnp.concatenate([value[None], slots[:-1]])
 
 
-def heard(world: World, radio: RadioState, first: int, size: int) -> Heard | None:
-    """What the vehicles ``first`` to ``first + size`` (in the order of the groups) heard last; leading axis U."""
+def heard(world: World, radio: RadioState, tick: jax.Array, first: int, size: int) -> Heard | None:
+    """What the vehicles ``first`` to ``first + size`` (in the order of the groups) heard last; leading axis U.
+
+    ``tick`` [] int32 are the control periods since the start, which the messages' age is counted to.
+    """
     if world.radio.mates == 0:
         return None
     index, valid = radio.heard_index[first : first + size], radio.heard[first : first + size]
@@ -87,7 +92,8 @@ def heard(world: World, radio: RadioState, first: int, size: int) -> Heard | Non
         return jnp.where(valid.reshape(valid.shape + (1,) * (found.ndim - 2)), found, 0.0)
 
     member = jnp.concatenate([jnp.asarray(group.member, jnp.int32) for group in world.groups])
-    age = jnp.full(size, world.radio.delay * world.timing.judge_period_s, jnp.float32)
+    ticks = world.radio.delay * world.timing.judge_ticks + tick - radio.tick
+    age = jnp.full(size, ticks * jnp.float32(world.timing.control_period_s))
     return Heard(
         member=jnp.where(valid, member[index], -1),
         position_m=of(radio.position_m),

@@ -64,6 +64,7 @@ class RadioState:
     velocity_m_s: jax.Array  # [D, V, 3] world
     yaw_rad: jax.Array  # [D, V]
     count_rate_cps: jax.Array  # [D, V]
+    tick: jax.Array  # [] int32: when slot 0 was sent, in control periods
     heard_index: jax.Array  # [V, K] int32: team mates of whom a message came
     heard: jax.Array  # [V, K] bool
 
