@@ -12,7 +12,7 @@ from swarmsim.config.documents import Document, Place, dotted
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.mission import Trigger
 from swarmsim.config.names import did_you_mean, one_of
-from swarmsim.config.policies import PolicySettings
+from swarmsim.config.policies import LandOn, PolicySettings
 from swarmsim.config.validation import validate
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 
@@ -78,6 +78,8 @@ def check_phases(scenario: Scenario) -> Iterator[Problem]:
     for i in range(len(scenario.mission.phases)):
         yield from _check_who(scenario, i)
         yield from _check_kinds(scenario, i)
+        yield from _check_partners(scenario, i)
+        yield from _check_landing(scenario, i)
         yield from _check_needs(scenario, i)
         yield from _check_speeds(scenario, i)
 
@@ -178,6 +180,44 @@ def _check_kinds(scenario: Scenario, i: int) -> Iterator[Problem]:
     kinds = frozenset(scenario.vehicles[k].kind for k in scenario.phase_members[i])
     for field, message in scenario.settings[i].faults(kinds):
         yield scenario.problem(("phases", i, "settings", field), message)
+
+
+def _check_partners(scenario: Scenario, i: int) -> Iterator[Problem]:
+    """Members of the team that settings name."""
+    settings = scenario.settings[i]
+    kinds = {member.name: vehicle.kind for member, vehicle in zip(scenario.members, scenario.vehicles, strict=True)}
+    for field, kind in settings.partners.items():
+        name = getattr(settings, field)
+        if kinds.get(name) == kind:
+            continue
+        suited = [other for other in kinds if kinds[other] == kind][:NAMES_SHOWN]
+        message = f"'{name}' is a {kinds[name]}" if name in kinds else f"there is no vehicle '{name}' in the team"
+        allowed = one_of(suited) if suited else f"a {kind}, and the team has none"
+        place: Place = ("phases", i, "settings", field)
+        yield scenario.problem(place, message, given=name, allowed=allowed, suggestion=did_you_mean(name, suited))
+
+
+def _check_landing(scenario: Scenario, i: int) -> Iterator[Problem]:
+    """Whether one vehicle lands on a rover, and has room for its feet there."""
+    settings, members = scenario.settings[i], scenario.phase_members[i]
+    if not isinstance(settings, LandOn):
+        return
+    if len(members) > 1:
+        message = f"one vehicle lands on '{settings.rover}', and {len(members)} are to follow the policy 'land_on'"
+        yield scenario.problem(("phases", i, "who"), message, suggestion="give each a phase and a rover of its own")
+    names = [member.name for member in scenario.members]
+    rover = scenario.vehicles[names.index(settings.rover)] if settings.rover in names else None
+    for vehicle in {scenario.members[k].type: scenario.vehicles[k] for k in members}.values():
+        if not isinstance(rover, SkidSteer) or not isinstance(vehicle, Multirotor):
+            continue
+        spans = [2.0 * max(abs(foot[axis]) for foot in vehicle.feet.positions_m) for axis in (0, 1)]
+        if any(span >= room for span, room in zip(spans, rover.chassis_size_m, strict=False)):
+            yield scenario.problem(
+                ("phases", i, "settings", "rover"),
+                f"the feet of the vehicle type '{vehicle.name}' do not fit on the deck of '{settings.rover}'",
+                given=f"feet over {spans[0]:.3g} m by {spans[1]:.3g} m",
+                allowed=f"less than {rover.chassis_size_m[0]:.3g} m by {rover.chassis_size_m[1]:.3g} m",
+            )
 
 
 def _check_needs(scenario: Scenario, i: int) -> Iterator[Problem]:

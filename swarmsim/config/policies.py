@@ -1,11 +1,11 @@
 """Settings of the policies, as they stand under ``phases.N.settings``."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from swarmsim.config.base import ConvexPolygon, Model, NonNegative, Positive, Vec2
+from swarmsim.config.base import ConvexPolygon, Model, Name, NonNegative, Positive, Vec2
 from swarmsim.config.vehicles import VEHICLE_KINDS
 
 Target = Literal["source", "hotspot"] | Vec2
@@ -20,6 +20,8 @@ class PolicySettings(Model):
 
     vehicles: ClassVar[tuple[str, ...]] = VEHICLE_KINDS
     """Kinds of vehicle that the policy can command."""
+    partners: ClassVar[Mapping[str, str]] = {}
+    """Fields that name a member of the team, and the kind of vehicle that it must be."""
     needs: ClassVar[tuple[str, ...]] = ()
     """What the mission must find for the policy: ``"source"``, ``"hotspot"``."""
 
@@ -107,6 +109,20 @@ class Waypoints(_Flown):
             yield "altitude_m", "a rover has no altitude: leave it out, or give the rovers a phase of their own"
 
 
+class LandOn(_Flown):
+    """Land on the member ``rover`` while it stands or drives, approaching at ``altitude_m`` above its deck.
+
+    ``speed_m_s`` is that of the approach, over the rover's own.
+    """
+
+    vehicles: ClassVar[tuple[str, ...]] = ("multirotor",)
+    partners: ClassVar[Mapping[str, str]] = {"rover": "skid_steer"}
+
+    rover: Name
+    altitude_m: float = Field(default=4.0, gt=1, le=200)
+    speed_m_s: float = Field(gt=0, le=30)
+
+
 class Hold(PolicySettings):
     """Stay where the vehicle is."""
 
@@ -116,6 +132,7 @@ SETTINGS: dict[str, type[PolicySettings]] = {
     "approach_and_orbit": ApproachAndOrbit,
     "orbit": Orbit,
     "waypoints": Waypoints,
+    "land_on": LandOn,
     "hold": Hold,
 }
 """Settings of the policies that the package carries."""

@@ -85,7 +85,7 @@ def shared_belief(plan: Plan, belief: Any) -> Belief | None:
 def heard_by(world: World, state: WorldState, number: int) -> Heard | None:
     """What the vehicles [U] of a group heard."""
     first = sum(group.size for group in world.groups[:number])
-    return heard(world, state.radio, first, world.groups[number].size)
+    return heard(world, state.radio, state.clock.tick, first, world.groups[number].size)
 
 
 def views(world: World, plan: Plan, state: WorldState, belief: Any) -> tuple[View, ...]:
@@ -100,7 +100,7 @@ def views(world: World, plan: Plan, state: WorldState, belief: Any) -> tuple[Vie
     return tuple(made)
 
 
-_SHARED = ("time_s", "belief", "settings", "site")  # of a view or a task: the same for all vehicles of a group
+_SHARED = ("time_s", "belief", "settings", "site", "known")  # of a view or a task: the same for all vehicles of a group
 
 
 def _axes(cls: Any) -> Any:
@@ -130,6 +130,7 @@ def tasks(world: World, plan: Plan, phase: Phase, place: Place, path: Any) -> Ta
         params=rows(world.groups[place.group].params, place.local),
         rank=jnp.asarray(place.rank, jnp.int32),
         path=None if path is None else rows(path, place.rank),
+        known=None if phase.plans else phase.task,
     )
 
 

@@ -127,8 +127,9 @@ def _fly(
         # what a place leaves out is filled with a copy of one of its vehicles: arrays then have the group's size
         fill = partial(_spread, group.size, role.place)
         task = tasks(world, plan, role.phase, role.place, phase.path)
-        own = replace(task, settings=None, site=None, params=None)  # type: ignore[arg-type]
-        given.append(replace(fill(own), settings=task.settings, site=task.site, params=group.params))
+        own = replace(task, settings=None, site=None, known=None, params=None)  # type: ignore[arg-type]
+        shared_by_all = {"settings": task.settings, "site": task.site, "known": task.known}
+        given.append(replace(fill(own), params=group.params, **shared_by_all))
         held = None if phase.held is None else fill(phase.held[role.phase.places.index(role.place)])
         parts.append(_Part(memory=fill(rows(phase.memory, role.place.rank)), held=held))
 
@@ -177,7 +178,8 @@ def _one(
     state = record_events(world, group.kind, shared.now_s, params, limits, state, collided)
 
     def view(state: GroupState, tick: jax.Array, latest: Reading | None) -> View:
-        own = view_of(group, params, limits.battery_j, state, latest, told)
+        aged = None if told is None else replace(told, age_s=told.age_s + (tick - shared.first) * period_s)
+        own = view_of(group, params, limits.battery_j, state, latest, aged)
         return replace(own, time_s=tick * period_s, belief=shared.belief)
 
     def tick(carry: Any, _: None) -> tuple[Any, None]:

@@ -94,7 +94,7 @@ class Trigger:
 class Phase:
     """One phase: M vehicles follow a policy."""
 
-    task: Any  # of the planner; None for a policy
+    task: Any  # of the planner, or what the policy knows of the scenario; None without
     settings: Values
     target_m: jax.Array  # [2] a given place to go to, world; zero otherwise
     start_s: jax.Array  # [] time of `at`, or the delay

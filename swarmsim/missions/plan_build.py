@@ -105,9 +105,8 @@ def _phase(scenario: Scenario, site_model: SiteModel, number: int) -> Phase:
     spec, settings = scenario.mission.phases[number], scenario.settings[number]
     members = scenario.phase_members[number]
     policy = _policy(scenario, spec)
-    plans = hasattr(policy.object, "plan")
     task: Any = None
-    if plans:
+    if hasattr(policy.object, "task"):
         assignment = Assignment(scenario=scenario, settings=settings, members=members, site_model=site_model)
         task = policy.object.task(assignment)
     target = getattr(settings, "target", None)

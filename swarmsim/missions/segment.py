@@ -14,7 +14,7 @@ from swarmsim.missions.plan import Phase, Plan, Trigger
 from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track
 from swarmsim.world import events
 from swarmsim.world.model import World
-from swarmsim.world.state import now_s
+from swarmsim.world.state import moving, now_s
 
 
 def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionState, Log, Signals]:
@@ -78,7 +78,7 @@ def _poses(mission: MissionState) -> tuple[Track, ...]:
             quaternion=g.vehicle.body.quaternion,
             velocity_m_s=g.vehicle.body.velocity_m_s,
             energy_j=g.vehicle.energy_j,
-            active=g.active,
+            active=g.active | (g.around.rides & ~jnp.isfinite(mission.over_s)),
         )
         for g in mission.world.groups
     )
@@ -171,7 +171,7 @@ def decide(world: World, plan: Plan, mission: MissionState) -> tuple[MissionStat
         world=replace(mission.world, groups=groups),
     )
     begin = jnp.stack([(f | a) & ~over for f, a in zip(first, again, strict=True)])
-    active = jnp.stack([jnp.any(g.active) for g in groups])
+    active = jnp.stack([jnp.any(moving(g)) & ~over for g in groups])
     return mission, Signals(begin=begin, running=jnp.stack(running), active=active, over=over)
 
 

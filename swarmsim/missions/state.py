@@ -57,7 +57,7 @@ class Signals:
 
     begin: jax.Array  # [P] bool: phases whose policy or planner is to be started or asked again
     running: jax.Array  # [P] bool: phases under way
-    active: jax.Array  # [G] bool: groups with a vehicle that has a part in the mission
+    active: jax.Array  # [G] bool: groups with a vehicle that has a part in the mission, or rides on a rover
     over: jax.Array  # [] bool
 
 
@@ -69,7 +69,7 @@ class Track:
     quaternion: jax.Array  # [T, U, 4] w x y z, body to world
     velocity_m_s: jax.Array  # [T, U, 3] world
     energy_j: jax.Array  # [T, U] used since the start
-    active: jax.Array  # [T, U] bool
+    active: jax.Array  # [T, U] bool: it had a part in the mission, or was carried along
 
 
 @pytree

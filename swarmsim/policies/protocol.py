@@ -22,7 +22,8 @@ class Policy(Protocol):
 
     ``period_s`` between two calls of `act` (each control period) · ``vehicles``: kinds of vehicle that it can steer
     (all) · ``Settings``: a `PolicySettings` class (no settings) · ``listens``: whether it reads ``view.heard`` (no) ·
-    ``done(task, memory, view) -> bool []``: whether the vehicle's part in the phase is over (never).
+    ``done(task, memory, view) -> bool []``: whether the vehicle's part in the phase is over (never) ·
+    ``task(assignment) -> pytree``: what it is to know of the scenario, made once on the host: ``task.known`` (nothing).
     """
 
     def start(self, task: Task, key: jax.Array) -> Any:
@@ -43,7 +44,7 @@ class Situation:
 
 @dataclass(frozen=True)
 class Assignment:
-    """What a planner is built from, on the host."""
+    """What a planner, or what a policy knows of the scenario, is built from, on the host."""
 
     scenario: Scenario
     settings: PolicySettings

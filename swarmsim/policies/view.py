@@ -24,6 +24,7 @@ class Task:
     params: Any  # its own parameters, e.g. ``params.control.speed_max_m_s``
     rank: jax.Array  # [] int32: number among the vehicles of the phase
     path: Path | None  # of a planner; None for a policy that needs none
+    known: Any  # what the policy's own `task` made of the scenario, shared by all vehicles; None without it
 
 
 @pytree

@@ -27,7 +27,7 @@ from swarmsim.site import SiteModel
 from swarmsim.world.build import build_world
 from swarmsim.world.model import World
 from swarmsim.world.state import Clock as WorldClock
-from swarmsim.world.state import WorldState
+from swarmsim.world.state import WorldState, moving
 from swarmsim.world.step import reset
 
 AT_ONCE = 8  # decision periods that one call runs: each call costs the host 2 ms
@@ -251,8 +251,8 @@ class _Run:
         return jax.tree.unflatten(structure, [None] * structure.num_leaves)
 
     def _running(self, mission: MissionState) -> np.ndarray:
-        """Groups [G] with an active vehicle in any mission."""
-        return np.array([bool(np.asarray(g.active).any()) for g in mission.world.groups])
+        """Groups [G] with a vehicle that is moved on in any mission."""
+        return np.array([bool(np.asarray(moving(g)).any()) for g in mission.world.groups])
 
     def conclude(self, mission: MissionState, keys: Any) -> Conclusion | None:
         """What the missions found in the end."""

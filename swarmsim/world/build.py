@@ -182,21 +182,23 @@ def _params(scenario: Scenario, spec: Spec, timing: Timing) -> Any:
     return multirotor_params(embodied(spec), scenario.mission.effects)
 
 
+def deck_of(spec: Spec, params: Any) -> tuple[float, float, float]:
+    """Half length, half width and height over the origin of a rover's upper side, m; zeros for what flies."""
+    if isinstance(spec, Multirotor):
+        return 0.0, 0.0, 0.0
+    length, width, tall = spec.chassis_size_m
+    origin = float(params.wheel_radius_m) - float(np.mean(np.asarray(params.wheel_position_m)[:, 2]))
+    return 0.5 * length, 0.5 * width, spec.chassis_height_m + 0.5 * tall - origin
+
+
 def _limits(specs: Sequence[Spec], params: Sequence[Any], home_m: Any) -> Limits:
     def half_height(spec: Spec) -> float:
         return 0.5 * (spec.collision_height_m if isinstance(spec, Multirotor) else spec.chassis_size_m[2])
 
-    def deck(spec: Spec, params: Any) -> tuple[float, float, float]:
-        if isinstance(spec, Multirotor):
-            return 0.0, 0.0, 0.0
-        length, width, tall = spec.chassis_size_m
-        origin = float(params.wheel_radius_m) - float(np.mean(np.asarray(params.wheel_position_m)[:, 2]))
-        return 0.5 * length, 0.5 * width, spec.chassis_height_m + 0.5 * tall - origin
-
     return Limits(
         radius_m=_f32([footprint_radius_m(spec) for spec in specs]),
         half_height_m=_f32([half_height(spec) for spec in specs]),
-        deck_m=_f32([deck(spec, own) for spec, own in zip(specs, params, strict=True)]),
+        deck_m=_f32([deck_of(spec, own) for spec, own in zip(specs, params, strict=True)]),
         impact_speed_m_s=_f32([spec.impact_speed_max_m_s for spec in specs]),
         battery_j=_f32([3600.0 * spec.battery.capacity_wh for spec in specs]),
         home_m=home_m,

@@ -9,10 +9,12 @@ from swarmsim.physics.contact import Plane
 from swarmsim.physics.rotations import rotation_matrix
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, World
-from swarmsim.world.state import GroupState
+from swarmsim.world.state import GroupState, moving
 
 BELOW_M = 0.15
 """Feet that are no further below a deck than this stand on it; a lower vehicle is beside the rover."""
+RIDES_BELOW_M = 0.1
+"""Height of its feet below which a multirotor over a deck is carried along."""
 
 
 def on_decks(world: World, groups: tuple[GroupState, ...]) -> tuple[GroupState, ...]:
@@ -27,18 +29,21 @@ def on_decks(world: World, groups: tuple[GroupState, ...]) -> tuple[GroupState, 
 
 
 def _decks(group: Group, g: GroupState) -> tuple[jax.Array, ...]:
-    """Middle [U, 3], attitude [U, 3, 3], velocity [U, 3] and half length and width [U, 2] of rovers' decks."""
+    """Middle [U, 3], attitude [U, 3, 3], velocity, turn rate [U, 3], half length and width [U, 2] of rovers' decks."""
     body, deck = g.vehicle.body, group.limits.deck_m
+    moves = moving(g)[:, None]  # the state of one that is not moved on keeps its last velocity
     attitude = jax.vmap(rotation_matrix)(body.quaternion)
     lift = attitude[:, :, 2] * deck[:, 2:]
     rate = jnp.sum(attitude * body.angular_velocity_rad_s[:, None, :], axis=-1)
-    return body.position_m + lift, attitude, body.velocity_m_s + jnp.cross(rate, lift), deck[:, :2]
+    velocity = jnp.where(moves, body.velocity_m_s + jnp.cross(rate, lift), 0.0)
+    return body.position_m + lift, attitude, velocity, jnp.where(moves, rate, 0.0), deck[:, :2]
 
 
 def _over(
-    group: Group, g: GroupState, middle: jax.Array, attitude: jax.Array, velocity: jax.Array, half: jax.Array
-) -> GroupState:
-    """Multirotors with the highest deck below them as their ground."""
+    group: Group, g: GroupState, middle: jax.Array, attitude: jax.Array, velocity: jax.Array, rate: jax.Array,
+    half: jax.Array,
+) -> GroupState:  # fmt: skip
+    """Multirotors with the highest deck below them as their ground, which moves as the deck does where they are."""
     kind = KINDS[group.kind]
     offset = g.vehicle.body.position_m[:, None] - middle
     within = jnp.all(jnp.abs(jnp.sum(offset[..., None] * attitude[None, :, :, :2], axis=-2)) < half, axis=-1)
@@ -48,11 +53,14 @@ def _over(
     held = jnp.where(within & (height > -BELOW_M), middle[:, 2], -jnp.inf)
     best = jnp.argmax(held, axis=1)
     over = jnp.isfinite(jnp.max(held, axis=1))
+    arm = jnp.take_along_axis(offset, best[:, None, None], axis=1)[:, 0]
     deck = jax.tree.map(lambda x: x[best], planes)
+    deck = replace(deck, velocity_m_s=deck.velocity_m_s + jnp.cross(rate[best], arm))
 
     def chosen(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(over.reshape(over.shape + (1,) * (new.ndim - 1)), new, old)
 
     ground = jax.tree.map(chosen, deck, g.around.ground)
     feet = jnp.take_along_axis(height, best[:, None], axis=1)[:, 0]
-    return replace(g, around=replace(g.around, ground=ground, height_m=chosen(feet, g.around.height_m)))
+    around = replace(g.around, ground=ground, height_m=chosen(feet, g.around.height_m))
+    return replace(g, around=replace(around, rides=over & (feet < RIDES_BELOW_M)))

@@ -31,6 +31,7 @@ class Surroundings:
     gust: GustState
     motor_noise: jax.Array | None  # [U, R] unit variance: errors of the rotors' speeds; None for what has no rotors
     height_m: jax.Array  # [U] of the lowest contact point above the ground
+    rides: jax.Array  # [U] bool: it stands on the deck of a rover, which carries it along
     hold: jax.Array  # [U] bool: another vehicle has the right of way
     push_m: jax.Array  # [U, 3] displacement that keeps apart from it, world
     nearest_m: jax.Array  # [U] distance of the nearest other vehicle
@@ -44,11 +45,16 @@ class GroupState:
     vehicle: Any  # state of the group's kind
     control: Any  # memory of its controller
     around: Surroundings
-    active: jax.Array  # [U] bool: has a part in the mission now; the others rest where they are, with motors off
+    active: jax.Array  # [U] bool: has a part in the mission now; the others rest on what they stand on, motors off
     impact_m_s: jax.Array  # [U] largest speed at which it met the ground or a wall since it was last judged
     finite: jax.Array  # [U] bool: its state is still made of numbers
     event_time_s: jax.Array  # [U, kinds] first time of each kind of event, inf where there was none
     counter: CounterState | None  # of its radiation detector
+
+
+def moving(state: GroupState) -> jax.Array:
+    """Which vehicles [...] are moved on: those with a part in the mission, and those that a rover carries along."""
+    return state.active | state.around.rides
 
 
 @pytree
@@ -57,7 +63,9 @@ class RadioState:
 
     position_m: jax.Array  # [D, V, 3] world; slot 0 was sent last
     velocity_m_s: jax.Array  # [D, V, 3] world
+    yaw_rad: jax.Array  # [D, V]
     count_rate_cps: jax.Array  # [D, V]
+    tick: jax.Array  # [] int32: when slot 0 was sent, in control periods
     heard_index: jax.Array  # [V, K] int32: team mates of whom a message came
     heard: jax.Array  # [V, K] bool
 

@@ -24,7 +24,7 @@ from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.multirotor import ground_below, wall_beside
 from swarmsim.world.radio import radio_start
-from swarmsim.world.state import Clock, GroupState, Readings, Surroundings, WorldState, now_s
+from swarmsim.world.state import Clock, GroupState, Readings, Surroundings, WorldState, moving, now_s
 
 
 def reset(world: World, key: jax.Array, *, active: bool = True) -> WorldState:
@@ -54,6 +54,7 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
         gust=jax.vmap(gust_start)(noise),
         motor_noise=jnp.zeros(motors) if motors else None,
         height_m=jnp.zeros(size),
+        rides=jnp.zeros(size, bool),
         hold=jnp.zeros(size, bool),
         push_m=jnp.zeros((size, 3)),
         nearest_m=jnp.full(size, jnp.inf, jnp.float32),
@@ -172,7 +173,7 @@ def move(world: World, kind: str, params: Any, state: GroupState, command: Any) 
     )  # fmt: skip
     total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))
     finite = jnp.isfinite(total)  # a sum is finite only if all of its parts are
-    moves = state.active & finite & state.finite
+    moves = moving(state) & finite & state.finite
     kept = jax.tree.map(lambda new, old: jnp.where(moves, new, old), (vehicle, control), (state.vehicle, state.control))
     impact = jnp.maximum(state.impact_m_s, jnp.where(moves, impact, 0.0))
     return Moved(vehicle=kept[0], control=kept[1], impact_m_s=impact, finite=state.finite & finite)

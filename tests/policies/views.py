@@ -34,7 +34,7 @@ def view(position_m: Any = (0.0, 0.0, 0.0), velocity_m_s: Any = (0.0, 0.0, 0.0),
     return View(position_m=position, velocity_m_s=jnp.asarray(velocity_m_s, jnp.float32), **seen | changes)
 
 
-def task(path: Path | None = None, params: Any = None) -> Task:
+def task(path: Path | None = None, params: Any = None, known: Any = None) -> Task:
     """A task on flat ground; a rover's lookahead is a metre."""
     return Task(
         settings=SimpleNamespace(),
@@ -44,4 +44,5 @@ def task(path: Path | None = None, params: Any = None) -> Task:
         params=SimpleNamespace(lookahead_m=jnp.float32(LOOKAHEAD_M)) if params is None else params,
         rank=jnp.int32(0),
         path=path,
+        known=known,
     )
