@@ -19,7 +19,8 @@ ORIGIN = 5.8
 """Virtual origin above the rotors in distances of opposite motors: the jet then has about the rotors' own induced
 velocity where it leaves them."""
 DEPTH_MAX, REACH_MAX = 40.0, 10.0
-"""How far down and aside a jet is felt, in distances of opposite motors; it fades over the last quarter."""
+"""How far down and aside a jet is felt, in distances of opposite motors; it fades over the last quarter, and
+sets in over the first quarter of one such distance below the rotors."""
 
 
 @pytree
@@ -62,6 +63,7 @@ def downwash(craft: Rotorcraft, near: Candidates) -> jax.Array:
     speed = jnp.where(blows, flow, 0.0) / (length * (1.0 + _SHAPE * square) ** 2)
     away = jnp.sum(below[..., :2] ** 2, axis=-1) / (REACH_MAX * REACH_MAX)
     near_enough = _faded(depth / DEPTH_MAX, span) * _faded(jnp.sqrt(away + 1e-12), span)
+    near_enough *= jnp.clip(4.0 * depth / jnp.maximum(span, 1e-3), 0.0, 1.0)  # nothing at the same height
     total = jnp.sum((near_enough * speed) ** 2, axis=1)
     return jnp.where(total > 0.0, jnp.sqrt(jnp.where(total > 0.0, total, 1.0)), 0.0)
 
