@@ -15,37 +15,47 @@ def free_body_step(
     force_n: jax.Array,
     torque_nm: jax.Array,
     rotor_momentum_nms: jax.Array,
+    first: jax.Array,
     dt: float,
 ) -> RigidState:
     """State after ``dt`` s under gravity, ``force_n`` [3] (N, world) and ``torque_nm`` [3] (N m, body).
 
-    Velocities first, then the pose with the new ones, as in MuJoCo's semi-implicit Euler scheme; the rate is that of
-    `rates_after`. ``inertia_kg_m2`` [3] are the principal moments about the body axes, ``mass_kg`` [] the mass,
-    ``rotor_momentum_nms`` [] the angular momentum of the rotors along body z, relative to the body.
+    The share ``first`` [] of the change of velocity comes before the motion and the rest after it. One half is exact
+    under a constant force (kick, drift, kick), and all of it is the semi-implicit Euler scheme, which keeps stiff
+    contacts stable; the rate is that of `rates_after`. ``inertia_kg_m2`` [3] are the principal moments about the body
+    axes, ``mass_kg`` [] the mass, ``rotor_momentum_nms`` [] the angular momentum of the rotors along body z, relative
+    to the body.
     """
     gravity = jnp.array([0.0, 0.0, -GRAVITY_M_S2], force_n.dtype)
-    velocity = body.velocity_m_s + dt * (force_n / mass_kg + gravity)
-    turning, rate = rates_after(body.angular_velocity_rad_s, inertia_kg_m2, torque_nm, rotor_momentum_nms, dt)
+    change = dt * (force_n / mass_kg + gravity)
+    turning, rate = rates_after(body.angular_velocity_rad_s, inertia_kg_m2, torque_nm, rotor_momentum_nms, first, dt)
     return RigidState(
-        position_m=body.position_m + dt * velocity,
+        position_m=body.position_m + dt * (body.velocity_m_s + first * change),
         quaternion=normalise(multiply(body.quaternion, from_rotation_vector(dt * turning))),
-        velocity_m_s=velocity,
+        velocity_m_s=body.velocity_m_s + change,
         angular_velocity_rad_s=rate,
     )
 
 
 def rates_after(
-    rate_rad_s: jax.Array, inertia_kg_m2: jax.Array, torque_nm: jax.Array, rotor_momentum_nms: jax.Array, dt: float
+    rate_rad_s: jax.Array,
+    inertia_kg_m2: jax.Array,
+    torque_nm: jax.Array,
+    rotor_momentum_nms: jax.Array,
+    first: jax.Array,
+    dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Mean body rate [3] during a step of ``dt`` s and body rate [3] after it.
 
-    The torque [3] (body) acts at once, and then the body turns freely in five exact rotations about its axes, in the
-    order x, y, z, y, x (Dullweber, Leimkuhler and McLachlan, "Symplectic splitting methods for rigid body molecular
-    dynamics", J. Chem. Phys. 107(15), 1997). Length of the angular momentum and energy do not drift; Euler's step with
-    the gyroscopic torque of the old rate gains energy at every step. Rotors that turn about body z with the angular
-    momentum ``rotor_momentum_nms`` [] relative to the body make it a gyrostat, whose z rotation is slower by that.
+    The torque [3] (body) acts at once, the share ``first`` [] of it before the body turns and the rest after that. It
+    turns freely in five exact rotations about its axes, in the order x, y, z, y, x (Dullweber, Leimkuhler and
+    McLachlan, "Symplectic splitting methods for rigid body molecular dynamics", J. Chem. Phys. 107(15), 1997). Length
+    of the angular momentum and energy do not drift; Euler's step with the gyroscopic torque of the old rate gains
+    energy at every step. Rotors that turn about body z with the angular momentum ``rotor_momentum_nms`` [] relative to
+    the body make it a gyrostat, whose z rotation is slower by that.
     """
-    kicked = rate_rad_s + dt * torque_nm / inertia_kg_m2
+    kick = dt * torque_nm / inertia_kg_m2
+    kicked = rate_rad_s + first * kick
     x, y, z = (kicked[axis] * inertia_kg_m2[axis] for axis in range(3))  # angular momentum, body axes
     z = z + rotor_momentum_nms
     per_x, per_y, per_z = (dt / inertia_kg_m2[axis] for axis in range(3))
@@ -54,8 +64,8 @@ def rates_after(
     x, y = _turned(x, y, per_z * (z - rotor_momentum_nms))
     z, x = _turned(z, x, 0.5 * per_y * y)
     y, z = _turned(y, z, 0.5 * per_x * x)
-    after = jnp.stack([x, y, z - rotor_momentum_nms]) / inertia_kg_m2
-    return 0.5 * (kicked + after), after
+    turned = jnp.stack([x, y, z - rotor_momentum_nms]) / inertia_kg_m2
+    return 0.5 * (kicked + turned), turned + (1.0 - first) * kick
 
 
 def torque_of_euler_step(

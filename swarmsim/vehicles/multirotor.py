@@ -246,9 +246,14 @@ def wrench(
             jnp.sum(x * across[:, 1] - y * across[:, 0] - params.rotor_spin * shaft_torque),
         ]
     )
+    force = jnp.append(jnp.sum(across, axis=0), jnp.sum(thrust))
+    return airframe_drag(params, air_velocity_m_s) + force, torque
+
+
+def airframe_drag(params: MultirotorParams, air_velocity_m_s: jax.Array) -> jax.Array:
+    """Drag [3] N of the airframe, which moves by ``air_velocity_m_s`` [3] through the air; both body frame."""
     airspeed = jnp.sqrt(jnp.sum(air_velocity_m_s**2) + 1e-12)  # the small term keeps the gradient finite at rest
-    drag = -params.drag_quadratic_kg_m * airspeed * air_velocity_m_s
-    return drag + jnp.append(jnp.sum(across, axis=0), jnp.sum(thrust)), torque
+    return -params.drag_quadratic_kg_m * airspeed * air_velocity_m_s
 
 
 def rotor_momentum(params: MultirotorParams, speed_rad_s: jax.Array) -> jax.Array:
