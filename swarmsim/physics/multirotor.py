@@ -17,10 +17,10 @@ import mujoco
 import numpy as np
 
 from swarmsim.config.errors import InputError
-from swarmsim.config.vehicles import Multirotor
+from swarmsim.config.vehicles import Multirotor, inertia_tensor
 from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench, wall_wrench
 from swarmsim.physics.rigid_body import free_body_step, rates_after, torque_of_euler_step
-from swarmsim.physics.rotations import from_yaw, multiply, rotation_matrix, to_body, to_world
+from swarmsim.physics.rotations import conjugate, from_yaw, multiply, normalise, rotation_matrix, to_body, to_world
 from swarmsim.pytree import pytree
 from swarmsim.scalars import Layout, over_vehicles
 from swarmsim.vehicles.battery import open_circuit_voltage, under_load
@@ -227,7 +227,8 @@ def longest_time_step(spec: Multirotor) -> float:
     """
     feet, eye = spec.feet, np.eye(3)
     ratio = feet.tangential_stiffness_n_m / feet.stiffness_n_m
-    inverse_mass = np.diag(1.0 / np.array([spec.mass_kg] * 3 + list(spec.inertia_kg_m2)))
+    inverse_mass = np.diag([1.0 / spec.mass_kg] * 6)
+    inverse_mass[3:, 3:] = np.linalg.inv(inertia_tensor(spec.inertia_kg_m2))
     stiffness = np.zeros((6, 6))
     for x, y, z in feet.positions_m:
         turn = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # velocity of the foot of a unit rate
@@ -255,6 +256,7 @@ def _analytic_body(dt: float) -> Integrate:
             body,
             mass_kg=params.mass_kg,
             inertia_kg_m2=params.inertia_kg_m2,
+            principal_axes=params.principal_axes,
             force_n=loads.force_n,
             torque_nm=loads.torque_nm,
             rotor_momentum_nms=loads.rotor_momentum_nms,
@@ -286,16 +288,21 @@ def _mjx_body(dt: float) -> Integrate:
             body_mass=jnp.stack([jnp.zeros_like(params.mass_kg), params.mass_kg]),
             body_inertia=jnp.stack([jnp.zeros_like(params.inertia_kg_m2), params.inertia_kg_m2]),
         )
-        inertia, rate = params.inertia_kg_m2, body.angular_velocity_rad_s
-        turning, after = rates_after(rate, inertia, loads.torque_nm, loads.rotor_momentum_nms, loads.first, dt)
+        inertia, axes, frame = params.inertia_kg_m2, params.principal_axes, body.quaternion
+        turning, after = rates_after(
+            body.angular_velocity_rad_s, inertia, axes, loads.torque_nm, loads.rotor_momentum_nms, loads.first, dt
+        )
+        rate = body.angular_velocity_rad_s
+        if axes is not None:  # MuJoCo's body has its frame along the principal axes
+            turned, frame = rotation_matrix(axes), multiply(frame, axes)
+            rate, turning = to_body(turned, rate), to_body(turned, turning)
         # MuJoCo's Euler step takes the gyroscopic torque of the old rate, which gains energy; under this torque it
         # turns the body by the mean rate of the step.
-        torque = torque_of_euler_step(rate, inertia, turning, dt)
-        torque_world = to_world(rotation_matrix(body.quaternion), torque)
-        load = jnp.concatenate([loads.force_n, torque_world])
+        torque = to_world(rotation_matrix(frame), torque_of_euler_step(rate, inertia, turning, dt))
+        load = jnp.concatenate([loads.force_n, torque])
         data = template.replace(
-            qpos=jnp.concatenate([jnp.zeros(3), body.quaternion]),  # float32 is fine near zero, and a step is short
-            qvel=jnp.concatenate([body.velocity_m_s, body.angular_velocity_rad_s]),
+            qpos=jnp.concatenate([jnp.zeros(3), frame]),  # float32 is fine near zero, and a step is short
+            qvel=jnp.concatenate([body.velocity_m_s, rate]),
             xfrc_applied=jnp.stack([jnp.zeros_like(load), load]),
         )
         data = mjx.step(swept, data)
@@ -303,7 +310,7 @@ def _mjx_body(dt: float) -> Integrate:
         late = (1.0 - loads.first) * (data.qvel[:3] - body.velocity_m_s)
         return RigidState(
             position_m=body.position_m + (data.qpos[:3] - dt * late),
-            quaternion=data.qpos[3:],
+            quaternion=data.qpos[3:] if axes is None else normalise(multiply(data.qpos[3:], conjugate(axes))),
             velocity_m_s=data.qvel[:3],
             angular_velocity_rad_s=after,
         )
