@@ -205,8 +205,19 @@ class Multirotor(Sourced):
         return self
 
 
+class Castors(Model):
+    """Castors in place of the rear wheels: a differential drive.
+
+    Each is a wheel without a motor, of the size and on the track of the driven ones, that rolls ahead and slides to all
+    sides against its own small ``friction``. ``load_share`` is the share of the weight on the two, on level ground.
+    """
+
+    friction: Positive
+    load_share: float = Field(gt=0, lt=1)
+
+
 class Wheels(Model):
-    """Four driven wheels: radius, mass, spacing and friction with the ground.
+    """Four wheels: radius, mass, spacing and friction with the ground. All are driven where there are no ``castors``.
 
     ``stiffness_n_m`` is load over sinkage of one tyre, ``damping_ratio`` that of the rover bouncing on its four tyres.
     """
@@ -220,6 +231,7 @@ class Wheels(Model):
     rolling_resistance: NonNegative
     stiffness_n_m: Positive
     damping_ratio: Positive
+    castors: Castors | None = None
 
 
 class WheelMotor(Model):
@@ -254,7 +266,7 @@ class SkidSteerControl(Model):
 
 
 class SkidSteer(Sourced):
-    """A four-wheel skid-steer rover (``configs/vehicles/<name>.yaml``)."""
+    """A rover on four wheels, skid-steered or with castors behind (``configs/vehicles/<name>.yaml``)."""
 
     kind: Literal["skid_steer"]
     name: Name
