@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+import numpy as np
+from pydantic import AfterValidator, Field, model_validator
 
 from swarmsim.config.base import Model, Name, NonNegative, Positive, PositiveVec3, Vec3
 from swarmsim.config.radiation import DetectorMount
@@ -52,6 +53,31 @@ class Sourced(Model):
         if faults:
             raise ValueError("; ".join(faults) + " (a path such as 'rotor' covers everything below it)")
         return self
+
+
+def _inertia(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    """The numbers of a tensor of inertia that a body can have; ValueError otherwise."""
+    if len(numbers) not in (3, 6):
+        raise ValueError("give three principal moments, or the six elements Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the tensor")
+    moments = np.linalg.eigvalsh(inertia_tensor(numbers))
+    words = ", ".join(f"{moment:.6g}" for moment in moments)
+    if moments[0] <= 0.0:
+        raise ValueError(f"the tensor of inertia must be positive definite: its principal moments are {words}")
+    if moments[2] > (1.0 + 1e-6) * (moments[0] + moments[1]):
+        raise ValueError(f"no body has these principal moments: the largest of {words} exceeds the sum of the others")
+    return numbers
+
+
+def inertia_tensor(numbers: tuple[float, ...]) -> np.ndarray:
+    """Tensor [3, 3] (kg m^2) of an `Inertia`."""
+    xx, yy, zz, xy, xz, yz = (*numbers, 0.0, 0.0, 0.0)[:6]
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+Inertia = Annotated[tuple[float, ...], Field(min_length=3, max_length=6), AfterValidator(_inertia)]
+"""Inertia about the centre of mass (kg m^2, body FLU): the three principal moments where the body's axes are the
+principal ones, or the six elements [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of the tensor, in the order of MuJoCo's
+``fullinertia``. As there and in URDF the last three are the elements themselves, Ixy the integral of -x y dm."""
 
 
 class BodyFile(Model):
@@ -145,14 +171,14 @@ class Multirotor(Sourced):
 
     ``collision_radius_m`` and ``collision_height_m`` are those of the upright cylinder around the vehicle, propellers
     and feet included. ``drag_quadratic_kg_m`` is the airframe's drag over the squared airspeed, or one such number
-    along each body axis.
+    along each body axis. ``inertia_kg_m2`` are three principal moments or six elements of the tensor (`Inertia`).
     """
 
     kind: Literal["multirotor"]
     name: Name
     description: str
     mass_kg: Positive
-    inertia_kg_m2: PositiveVec3
+    inertia_kg_m2: Inertia
     rotors: tuple[Rotor, ...] = Field(min_length=3)
     rotor: RotorModel
     drag_quadratic_kg_m: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
@@ -181,8 +207,19 @@ class Multirotor(Sourced):
         return self
 
 
+class Castors(Model):
+    """Castors in place of the rear wheels: a differential drive.
+
+    Each is a wheel without a motor, of the size and on the track of the driven ones, that rolls ahead and slides to all
+    sides against its own small ``friction``. ``load_share`` is the share of the weight on the two, on level ground.
+    """
+
+    friction: Positive
+    load_share: float = Field(gt=0, lt=1)
+
+
 class Wheels(Model):
-    """Four driven wheels: radius, mass, spacing and friction with the ground.
+    """Four wheels: radius, mass, spacing and friction with the ground. All are driven where there are no ``castors``.
 
     ``stiffness_n_m`` is load over sinkage of one tyre, ``damping_ratio`` that of the rover bouncing on its four tyres.
     """
@@ -196,6 +233,7 @@ class Wheels(Model):
     rolling_resistance: NonNegative
     stiffness_n_m: Positive
     damping_ratio: Positive
+    castors: Castors | None = None
 
 
 class WheelMotor(Model):
@@ -230,7 +268,7 @@ class SkidSteerControl(Model):
 
 
 class SkidSteer(Sourced):
-    """A four-wheel skid-steer rover (``configs/vehicles/<name>.yaml``)."""
+    """A rover on four wheels, skid-steered or with castors behind (``configs/vehicles/<name>.yaml``)."""
 
     kind: Literal["skid_steer"]
     name: Name

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.control.commands import ATTITUDE, BODY_RATE, POSITION, MultirotorCommand, PositionCommand
+from swarmsim.physics.rigid_body import times_inertia
 from swarmsim.physics.rotations import conjugate, multiply, rotation_matrix, to_body
 from swarmsim.pytree import pytree
 from swarmsim.vehicles.multirotor import ControlParams, MultirotorParams
@@ -166,8 +167,9 @@ def _rotor_speeds_of(
     autopilot: ControlParams, body: RigidState, rate: jax.Array, integral: jax.Array, thrust: jax.Array
 ) -> jax.Array:
     """Rotor speeds [R] rad/s for body rates [3] rad/s and a collective thrust [] N."""
-    w, inertia = body.angular_velocity_rad_s, autopilot.inertia_kg_m2
-    torque = inertia * autopilot.rate_gain_1_s * (rate - w + integral) + jnp.cross(w, inertia * w)
+    w, inertia, axes = body.angular_velocity_rad_s, autopilot.inertia_kg_m2, autopilot.principal_axes
+    turn = times_inertia(inertia, axes, autopilot.rate_gain_1_s * (rate - w + integral))
+    torque = turn + jnp.cross(w, times_inertia(inertia, axes, w))
     return rotor_commands(autopilot, thrust, torque)
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.physics.rotations import rotate_inverse, yaw_of
-from swarmsim.vehicles.skid_steer import SkidSteerParams, effective_track, turning_force
+from swarmsim.vehicles.skid_steer import SkidSteerParams, turning_force, turning_track
 from swarmsim.vehicles.state import SkidSteerState
 
 YAW_RATE_FEEDBACK = 0.5  # gain from the yaw-rate error to the yaw-rate command
@@ -27,14 +27,16 @@ def wheel_speeds(
     measured = state.body.angular_velocity_rad_s[2]
     yaw_rate = yaw_rate_rad_s + YAW_RATE_FEEDBACK * (yaw_rate_rad_s - measured)
     side = jnp.array([-1.0, 1.0, -1.0, 1.0])
-    half_track = 0.5 * effective_track(params.wheel_position_m)
+    half_track = 0.5 * turning_track(params)
     wanted = (speed_m_s + side * half_track * yaw_rate) / params.wheel_radius_m
     weight = params.mass_kg * params.gravity_m_s2
     up = rotate_inverse(state.body.quaternion, jnp.array([0.0, 0.0, 1.0]))
     skid_onset = jnp.tanh(half_track * yaw_rate_rad_s / params.wheel_radius_m / FRICTION_ONSET_RAD_S)
     rolling_onset = jnp.tanh(wanted / FRICTION_ONSET_RAD_S)
     force = weight * up[0] + side * skid_onset * turning_force(params, weight)
-    torque = 0.25 * params.wheel_radius_m * (force + rolling_onset * params.rolling_resistance * weight)
+    torque = (
+        params.wheel_radius_m / jnp.sum(params.driven) * (force + rolling_onset * params.rolling_resistance * weight)
+    )
     command = wanted + torque / params.speed_gain_nm_s
     return command / jnp.maximum(1.0, jnp.max(jnp.abs(command)) / params.wheel_speed_max_rad_s)
 

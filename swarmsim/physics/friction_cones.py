@@ -53,10 +53,10 @@ class Contacts:
     rolling: jax.Array  # [4] m
     reference: jax.Array  # [4, 3] m/s^2
     stiffness_kg: jax.Array  # [4] zero for a wheel in the air
-    opening: jax.Array  # []
+    opening: jax.Array  # [4]
     mass_kg: jax.Array  # []
     inertia_kg_m2: jax.Array  # [3, 3]
-    wheel_inertia_kg_m2: jax.Array  # []
+    wheel_inertia_kg_m2: jax.Array  # [4]
     force_n: jax.Array  # [3] body frame
     torque_nm: jax.Array  # [3] body frame
     wheel_torque_nm: jax.Array  # [4]

@@ -1,7 +1,9 @@
 """How a multirotor moves: two engines behind one signature.
 
 Both take the same loads (rotors, drag, feet) and differ in who integrates the body: ``mjx`` steps MuJoCo's model of it,
-``analytic`` the closed form of a free body.
+``analytic`` the closed form of a free body. In the air both are of second order: air and attitude are those of the
+middle of the step, and half of the change of velocity comes before the motion. While something is touched all of it
+does, as in MuJoCo's Euler scheme.
 """
 
 from collections.abc import Callable
@@ -15,15 +17,16 @@ import mujoco
 import numpy as np
 
 from swarmsim.config.errors import InputError
-from swarmsim.config.vehicles import Multirotor
+from swarmsim.config.vehicles import Multirotor, inertia_tensor
 from swarmsim.physics.contact import ContactPoints, Plane, contact_wrench, wall_wrench
 from swarmsim.physics.rigid_body import free_body_step, rates_after, torque_of_euler_step
-from swarmsim.physics.rotations import from_yaw, multiply, rotation_matrix, to_body, to_world
+from swarmsim.physics.rotations import conjugate, from_yaw, multiply, normalise, rotation_matrix, to_body, to_world
 from swarmsim.pytree import pytree
 from swarmsim.scalars import Layout, over_vehicles
 from swarmsim.vehicles.battery import open_circuit_voltage, under_load
 from swarmsim.vehicles.multirotor import (
     MultirotorParams,
+    airframe_drag,
     battery_power,
     free_body_mjcf,
     rotor_momentum,
@@ -34,13 +37,13 @@ from swarmsim.vehicles.state import GRAVITY_M_S2, MultirotorState, RigidState
 
 Engine = Literal["mjx", "analytic"]
 Step = Callable[..., MultirotorState]
-Integrate = Callable[[MultirotorParams, RigidState, jax.Array, jax.Array, jax.Array], RigidState]
 
 
 @pytree
 class Loads:
     """What acts on the body during one step, and what the step makes of the rest of the state."""
 
+    first: jax.Array  # [] share of the change of velocity that comes before the motion: 1/2 in the air, 1 in contact
     force_n: jax.Array  # [3] N, world
     torque_nm: jax.Array  # [3] N m, body; the rotors' gyroscopic torque apart
     rotor_momentum_nms: jax.Array  # [] N m s, along body z
@@ -49,6 +52,9 @@ class Loads:
     ground_force_n: jax.Array  # [] N along the ground's normal
     power_w: jax.Array  # [] W that the battery's cells give
     voltage_v: jax.Array  # [] V at its terminals
+
+
+Integrate = Callable[[MultirotorParams, RigidState, Loads], RigidState]
 
 
 def make_multirotor_step(engine: Engine, dt: float, layout: Layout = "scalars") -> Step:
@@ -83,7 +89,7 @@ def make_multirotor_step(engine: Engine, dt: float, layout: Layout = "scalars") 
     ) -> MultirotorState:
         loads = step_loads(params, state, rotor_command_rad_s, wind_m_s, ground, dt, wall)
         return MultirotorState(
-            body=integrate(params, state.body, loads.force_n, loads.torque_nm, loads.rotor_momentum_nms),
+            body=integrate(params, state.body, loads),
             rotor_speed_rad_s=loads.rotor_speed_rad_s,
             contact_slip_m=loads.contact_slip_m,
             ground_force_n=loads.ground_force_n,
@@ -115,51 +121,62 @@ def step_loads(
 ) -> Loads:
     """Loads on the vehicle over a step of ``dt`` s; the wind [3] m/s is the air's velocity in the world."""
     body = state.body
-    attitude = rotation_matrix(body.quaternion)
+    attitude, rate = rotation_matrix(body.quaternion), body.angular_velocity_rad_s
     velocity = to_body(attitude, body.velocity_m_s)
     normal = to_body(attitude, ground.normal)
     height = jnp.sum((body.position_m - ground.point_m) * ground.normal)
     contact_height = height + jnp.sum(params.contact_position_m * normal, axis=-1)
     rotor_height = height + jnp.sum(params.rotor_position_m * normal, axis=-1)
-    speed = rotor_speeds(params, state.rotor_speed_rad_s, rotor_command_rad_s, state.voltage_v, dt)
-    air_force, air_torque = wrench(
-        params,
-        speed_before_rad_s=state.rotor_speed_rad_s,
-        speed_after_rad_s=speed,
-        rotor_height_m=rotor_height,
-        air_velocity_m_s=velocity - to_body(attitude, wind_m_s),
-        angular_velocity_rad_s=body.angular_velocity_rad_s,
-        dt=dt,
-    )
-    ground_force, ground_torque, slip = contact_wrench(
+    contact_force, contact_torque, slip = contact_wrench(
         contact_points(params),
         slip_m=state.contact_slip_m,
         height_m=contact_height,
         normal=normal,
         velocity_m_s=velocity if ground.velocity_m_s is None else velocity - to_body(attitude, ground.velocity_m_s),
-        angular_velocity_rad_s=body.angular_velocity_rad_s,
+        angular_velocity_rad_s=rate,
         dt=dt,
     )
-    force, torque = air_force + ground_force, air_torque + ground_torque
+    ground_force = jnp.sum(contact_force * normal)
+    touches = ground_force > 0.0
     if wall is not None:
+        away = to_body(attitude, wall.normal)
         push, turn = wall_wrench(
             contact_points(params),
             radius_m=params.collision_radius_m,
             distance_m=jnp.sum((body.position_m - wall.point_m) * wall.normal),
-            normal=to_body(attitude, wall.normal),
+            normal=away,
             velocity_m_s=velocity,
-            angular_velocity_rad_s=body.angular_velocity_rad_s,
+            angular_velocity_rad_s=rate,
         )
-        force, torque = force + push, torque + turn
+        contact_force, contact_torque = contact_force + push, contact_torque + turn
+        touches |= jnp.sum(push * away) > 0.0
+    speed = rotor_speeds(params, state.rotor_speed_rad_s, rotor_command_rad_s, state.voltage_v, dt)
+    air = velocity - to_body(attitude, wind_m_s)
+    thrust = params.thrust_coefficient_n_s2 * jnp.sum((0.5 * (state.rotor_speed_rad_s + speed)) ** 2)
+    pull = (contact_force + airframe_drag(params, air)) / params.mass_kg - GRAVITY_M_S2 * attitude[2]
+    pull = pull + jnp.stack([jnp.zeros_like(thrust), jnp.zeros_like(thrust), thrust / params.mass_kg])
+    # Air and forces in the axes that the body has in the middle of the step.
+    air = air + 0.5 * dt * (pull - jnp.cross(rate, air))
+    air_force, air_torque = wrench(
+        params,
+        speed_before_rad_s=state.rotor_speed_rad_s,
+        speed_after_rad_s=speed,
+        rotor_height_m=rotor_height,
+        air_velocity_m_s=air,
+        angular_velocity_rad_s=rate,
+        dt=dt,
+    )
+    air_force = air_force + 0.5 * dt * jnp.cross(rate, air_force)
     power = battery_power(params, speed_before_rad_s=state.rotor_speed_rad_s, speed_after_rad_s=speed, dt=dt)
     voltage, drawn = under_load(params.battery, state.energy_j, power)
     return Loads(
-        force_n=to_world(attitude, force),
-        torque_nm=torque,
+        first=jnp.where(touches, 1.0, 0.5),
+        force_n=to_world(attitude, contact_force + air_force),
+        torque_nm=contact_torque + air_torque,
         rotor_momentum_nms=rotor_momentum(params, speed),
         rotor_speed_rad_s=speed,
         contact_slip_m=slip,
-        ground_force_n=jnp.sum(ground_force * normal),
+        ground_force_n=ground_force,
         power_w=drawn,
         voltage_v=voltage,
     )
@@ -210,7 +227,8 @@ def longest_time_step(spec: Multirotor) -> float:
     """
     feet, eye = spec.feet, np.eye(3)
     ratio = feet.tangential_stiffness_n_m / feet.stiffness_n_m
-    inverse_mass = np.diag(1.0 / np.array([spec.mass_kg] * 3 + list(spec.inertia_kg_m2)))
+    inverse_mass = np.diag([1.0 / spec.mass_kg] * 6)
+    inverse_mass[3:, 3:] = np.linalg.inv(inertia_tensor(spec.inertia_kg_m2))
     stiffness = np.zeros((6, 6))
     for x, y, z in feet.positions_m:
         turn = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # velocity of the foot of a unit rate
@@ -233,16 +251,16 @@ def _as_scalars(integrate: Integrate) -> Integrate:
 
 
 def _analytic_body(dt: float) -> Integrate:
-    def integrate(
-        params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array, momentum_nms: jax.Array
-    ) -> RigidState:
+    def integrate(params: MultirotorParams, body: RigidState, loads: Loads) -> RigidState:
         return free_body_step(
             body,
             mass_kg=params.mass_kg,
             inertia_kg_m2=params.inertia_kg_m2,
-            force_n=force_n,
-            torque_nm=torque_nm,
-            rotor_momentum_nms=momentum_nms,
+            principal_axes=params.principal_axes,
+            force_n=loads.force_n,
+            torque_nm=loads.torque_nm,
+            rotor_momentum_nms=loads.rotor_momentum_nms,
+            first=loads.first,
             dt=dt,
         )
 
@@ -264,30 +282,35 @@ def _mjx_body(dt: float) -> Integrate:
 
     model, template = _free_body(dt)  # constants of the compiled step
 
-    def integrate(
-        params: MultirotorParams, body: RigidState, force_n: jax.Array, torque_nm: jax.Array, momentum_nms: jax.Array
-    ) -> RigidState:
+    def integrate(params: MultirotorParams, body: RigidState, loads: Loads) -> RigidState:
         swept = replace(
             model,
             body_mass=jnp.stack([jnp.zeros_like(params.mass_kg), params.mass_kg]),
             body_inertia=jnp.stack([jnp.zeros_like(params.inertia_kg_m2), params.inertia_kg_m2]),
         )
-        inertia, rate = params.inertia_kg_m2, body.angular_velocity_rad_s
-        turning, after = rates_after(rate, inertia, torque_nm, momentum_nms, dt)
+        inertia, axes, frame = params.inertia_kg_m2, params.principal_axes, body.quaternion
+        turning, after = rates_after(
+            body.angular_velocity_rad_s, inertia, axes, loads.torque_nm, loads.rotor_momentum_nms, loads.first, dt
+        )
+        rate = body.angular_velocity_rad_s
+        if axes is not None:  # MuJoCo's body has its frame along the principal axes
+            turned, frame = rotation_matrix(axes), multiply(frame, axes)
+            rate, turning = to_body(turned, rate), to_body(turned, turning)
         # MuJoCo's Euler step takes the gyroscopic torque of the old rate, which gains energy; under this torque it
         # turns the body by the mean rate of the step.
-        torque = torque_of_euler_step(rate, inertia, turning, dt)
-        torque_world = to_world(rotation_matrix(body.quaternion), torque)
-        load = jnp.concatenate([force_n, torque_world])
+        torque = to_world(rotation_matrix(frame), torque_of_euler_step(rate, inertia, turning, dt))
+        load = jnp.concatenate([loads.force_n, torque])
         data = template.replace(
-            qpos=jnp.concatenate([body.position_m, body.quaternion]),
-            qvel=jnp.concatenate([body.velocity_m_s, body.angular_velocity_rad_s]),
+            qpos=jnp.concatenate([jnp.zeros(3), frame]),  # float32 is fine near zero, and a step is short
+            qvel=jnp.concatenate([body.velocity_m_s, rate]),
             xfrc_applied=jnp.stack([jnp.zeros_like(load), load]),
         )
         data = mjx.step(swept, data)
+        # It also moves the body by the new velocity, which is too far by what has to come after the motion.
+        late = (1.0 - loads.first) * (data.qvel[:3] - body.velocity_m_s)
         return RigidState(
-            position_m=data.qpos[:3],
-            quaternion=data.qpos[3:],
+            position_m=body.position_m + (data.qpos[:3] - dt * late),
+            quaternion=data.qpos[3:] if axes is None else normalise(multiply(data.qpos[3:], conjugate(axes))),
             velocity_m_s=data.qvel[:3],
             angular_velocity_rad_s=after,
         )

@@ -85,8 +85,10 @@ def _height(params: SkidSteerParams) -> jax.Array:
 def _loads(params: SkidSteerParams, weight: jax.Array) -> jax.Array:
     """Load [4] (N) of each wheel under the ``weight`` [3] (N, body), with the moment of its part along the ground."""
     base, track = wheel_spacing(params.wheel_position_m)
-    lean = _height(params) * weight[:2] * 4.0 / jnp.stack([base * base, track * track])
-    share = -weight[2] + jnp.sum(params.wheel_position_m[:, :2] * lean, axis=-1)
+    place = params.wheel_position_m[:, :2]
+    middle = jnp.mean(place, axis=0)
+    lean = (_height(params) * weight[:2] + weight[2] * middle) * 4.0 / jnp.stack([base * base, track * track])
+    share = -weight[2] + jnp.sum((place - middle) * lean, axis=-1)
     return 0.25 * jnp.maximum(share, 0.0)
 
 
@@ -188,8 +190,9 @@ def _tips(params: SkidSteerParams, weight: jax.Array) -> jax.Array:
     """Whether [] the ``weight`` [3] (N, body) tips the rover over its wheels, which hold it by friction at most."""
     base, track = wheel_spacing(params.wheel_position_m)
     down = -weight[2]
-    held = jnp.minimum(jnp.abs(weight[:2]), params.friction * down)
-    return jnp.any(_height(params) * held > 0.5 * down * jnp.stack([base, track])) | (down <= 0.0)
+    held = jnp.minimum(jnp.abs(weight[:2]), jnp.mean(params.friction) * down)
+    reach = 0.5 * jnp.stack([base, track]) - jnp.abs(jnp.mean(params.wheel_position_m[:, :2], axis=0))
+    return jnp.any(_height(params) * held > down * reach) | (down <= 0.0)
 
 
 def _laid_down(moved: RigidState, before: RigidState, rotation: jax.Array, tips: jax.Array) -> RigidState:

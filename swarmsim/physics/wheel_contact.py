@@ -17,7 +17,7 @@ def mass_matrix(params: SkidSteerParams) -> jax.Array:
     """Mass matrix [10, 10] of the generalised velocities."""
     rover = jnp.zeros((6, 6)).at[:3, :3].set(params.mass_kg * jnp.eye(3)).at[3:, 3:].set(params.inertia_kg_m2)
     coupling = jnp.zeros((6, 4)).at[4].set(params.wheel_inertia_kg_m2)
-    wheels = (params.wheel_inertia_kg_m2 + params.rotor_inertia_kg_m2) * jnp.eye(4)
+    wheels = (params.wheel_inertia_kg_m2 + params.rotor_inertia_kg_m2) * jnp.eye(4)  # a diagonal: [4] along it
     return jnp.block([[rover, coupling], [coupling.T, wheels]])
 
 
@@ -77,7 +77,8 @@ def contacts(
     arm = params.wheel_position_m - normal * reach[:, None]
     in_plane = jax.lax.rsqrt(jnp.maximum(normal[:, 0] ** 2 + normal[:, 2] ** 2, 1e-6))
     ahead = jnp.stack([normal[:, 2] * in_plane, jnp.zeros(4), -normal[:, 0] * in_plane], axis=-1)
-    axes = jnp.stack([opening * normal, friction * ahead, friction * jnp.cross(normal, ahead)], axis=1)
+    across = friction[:, None] * jnp.cross(normal, ahead)
+    axes = jnp.stack([opening[:, None] * normal, friction[:, None] * ahead, across], axis=1)
     moments = jnp.cross(arm[:, None, :], axes)
     rolling = -friction * reach / in_plane
     velocity = jnp.sum(axes * twist[:3], axis=-1) + jnp.sum(moments * twist[3:6], axis=-1)
@@ -93,16 +94,16 @@ def contacts(
         stiffness_kg=jnp.where(distance < 0.0, normal_mass / (opening * opening), 0.0),
         opening=opening,
         mass_kg=params.mass_kg,
-        inertia_kg_m2=params.inertia_kg_m2 - 4.0 * share * params.wheel_inertia_kg_m2 * pitch[:, None] * pitch,
+        inertia_kg_m2=params.inertia_kg_m2 - jnp.sum(share) * params.wheel_inertia_kg_m2 * pitch[:, None] * pitch,
         wheel_inertia_kg_m2=params.wheel_inertia_kg_m2 + params.rotor_inertia_kg_m2,
         force_n=smooth[:3],
-        torque_nm=smooth[3:6] - share * jnp.sum(smooth[6:]) * pitch,
+        torque_nm=smooth[3:6] - jnp.sum(share * smooth[6:]) * pitch,
         wheel_torque_nm=smooth[6:],
     )
 
 
 def _pitch_share(params: SkidSteerParams) -> jax.Array:
-    """Inertia of a wheel without its motor over that with it []: couples wheels and pitch in the mass matrix."""
+    """Inertia of each wheel without its motor over that with it [4]: couples wheels and pitch in the mass matrix."""
     return params.wheel_inertia_kg_m2 / (params.wheel_inertia_kg_m2 + params.rotor_inertia_kg_m2)
 
 

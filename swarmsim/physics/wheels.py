@@ -10,10 +10,13 @@ ROLLING_ONSET_RAD_S = 0.1  # wheel speed at which the regularised rolling resist
 
 
 def motor_torque(params: SkidSteerParams, state: SkidSteerState, command_rad_s: jax.Array, dt: float) -> jax.Array:
-    """Torque [4] (N m) of the motors after this step: proportional speed loop, limit, exact first-order lag."""
+    """Torque [4] (N m) of the motors after this step: proportional speed loop, limit, exact first-order lag.
+
+    A castor has no motor.
+    """
     limit = params.wheel_speed_max_rad_s
     error = jnp.clip(command_rad_s, -limit, limit) - state.wheel_speed_rad_s
-    wanted = jnp.clip(params.speed_gain_nm_s * error, -params.torque_max_nm, params.torque_max_nm)
+    wanted = params.driven * jnp.clip(params.speed_gain_nm_s * error, -params.torque_max_nm, params.torque_max_nm)
     return wanted + (state.wheel_torque_nm - wanted) * jnp.exp(-dt / params.motor_time_constant_s)
 
 

@@ -24,6 +24,7 @@ from swarmsim.vehicles.rover_body import RoverBody, steiner
 Floats = NDArray[np.float64]
 
 _XACRO = "{http://www.ros.org/wiki/xacro}"
+_ROUNDING = 1e-6  # products of inertia below this share of the least moment are none
 _LEVEL_M = 1e-3  # wheels of a rover agree to this
 
 
@@ -123,15 +124,15 @@ def read_rover_body(source: BodyFile) -> RoverBody:
 def with_file_body(spec: Multirotor) -> Multirotor:
     """``spec`` with the mass and the inertia of its body file; as it is when it names none.
 
-    Raises `InputError` as `read_body` does, and when the body's axes are not its principal axes.
+    Raises `InputError` as `read_body` does.
     """
     if spec.body is None:
         return spec
     body = read_body(spec.body)
-    diagonal = np.diag(body.inertia_kg_m2)
-    if np.abs(body.inertia_kg_m2 - np.diag(diagonal)).max() > 0.02 * diagonal.min():
-        raise InputError.of("the body's axes must be its principal axes: products of inertia above 2 %", file=body.file)
-    return spec.model_copy(update={"mass_kg": body.mass_kg, "inertia_kg_m2": tuple(map(float, diagonal))})
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia_kg_m2.tolist()
+    skew = max(map(abs, (xy, xz, yz))) > _ROUNDING * min(xx, yy, zz)
+    inertia = (xx, yy, zz, xy, xz, yz) if skew else (xx, yy, zz)
+    return spec.model_copy(update={"mass_kg": body.mass_kg, "inertia_kg_m2": inertia})
 
 
 def _urdf_text(path: Path, args: dict[str, str | float | int | bool]) -> str:

@@ -4,15 +4,17 @@ Everything here is one vehicle in its body frame FLU (x forward, y left, z up, o
 All rotor axes point along body z.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from swarmsim.config.flight import FlightEffects
-from swarmsim.config.vehicles import Multirotor, RotorModel
+from swarmsim.config.vehicles import Multirotor, RotorModel, inertia_tensor
 from swarmsim.pytree import on_device, pytree
 from swarmsim.vehicles.battery import BatteryParams
 from swarmsim.vehicles.rotors import AIR_DENSITY_KG_M3, RotorAir, thrusts
@@ -27,7 +29,8 @@ class ControlParams:
     """The autopilot's gains, limits and what it believes of the vehicle; sweeping the true mass leaves them alone."""
 
     mass_kg: jax.Array  # [] kg, nominal
-    inertia_kg_m2: jax.Array  # [3] kg m^2, nominal, body
+    inertia_kg_m2: jax.Array  # [3] kg m^2, nominal, principal
+    principal_axes: jax.Array | None = None  # [4] as in `MultirotorParams`
     allocation: jax.Array  # [R, 4] rotor thrust (N) for thrust (N) and torque x, y, z (N m, body): pseudo-inverse
     thrust_coefficient_n_s2: jax.Array  # [] N/(rad/s)^2, nominal
     speed_min_rad_s: jax.Array  # [] rad/s
@@ -52,7 +55,8 @@ class MultirotorParams:
     """Physics of one multirotor; every leaf may be swept without compiling anew."""
 
     mass_kg: jax.Array  # [] kg
-    inertia_kg_m2: jax.Array  # [3] kg m^2, principal, body axes
+    inertia_kg_m2: jax.Array  # [3] kg m^2, principal moments
+    principal_axes: jax.Array | None = None  # [4] quaternion, principal axes to body; None: they are the body's axes
     rotor_position_m: jax.Array  # [R, 3] m, body
     rotor_spin: jax.Array  # [R] +1 counter-clockwise seen from above, -1 clockwise
     thrust_coefficient_n_s2: jax.Array  # [] N/(rad/s)^2
@@ -86,9 +90,10 @@ def multirotor_params(spec: Multirotor, effects: FlightEffects | None = None) ->
     arms = np.array([r.position_m for r in spec.rotors])
     rotor, feet, battery = spec.rotor, spec.feet, spec.battery
     contacts = np.concatenate([np.array(feet.positions_m), arms])
+    moments, axes = principal_inertia(spec)
     numbers = {
         "mass_kg": spec.mass_kg,
-        "inertia_kg_m2": spec.inertia_kg_m2,
+        "inertia_kg_m2": moments,
         "rotor_position_m": arms,
         "rotor_spin": _spins(spec),
         "thrust_coefficient_n_s2": rotor.thrust_coefficient_n_s2,
@@ -120,10 +125,29 @@ def multirotor_params(spec: Multirotor, effects: FlightEffects | None = None) ->
     air = _rotor_air(spec, effects)
     return MultirotorParams(
         **_float32(numbers),
+        principal_axes=None if axes is None else on_device(axes),
         rotor_air=air,
         battery=BatteryParams(**_float32(pack)),
         control=control_params(spec, air),
     )
+
+
+def principal_inertia(spec: Multirotor) -> tuple[np.ndarray, np.ndarray | None]:
+    """Principal moments [3] (kg m^2) and the quaternion [4] from their axes to the body's; None: they are those axes.
+
+    Of the many ways to name and to point the principal axes, that nearest to the body's axes.
+    """
+    tensor = inertia_tensor(spec.inertia_kg_m2)
+    if np.array_equal(tensor, np.diag(np.diag(tensor))):
+        return np.diag(tensor), None
+    moments, axes = np.linalg.eigh(tensor)
+    order = max(itertools.permutations(range(3)), key=lambda p: np.abs(axes[range(3), p]).prod())
+    moments, axes = moments[list(order)], axes[:, order]
+    axes = axes * np.where(np.diag(axes) < 0.0, -1.0, 1.0)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    quaternion = np.zeros(4)
+    mujoco.mju_mat2Quat(quaternion, axes.ravel())
+    return moments, quaternion
 
 
 def hover_induced(rotor: RotorModel) -> float:
@@ -161,9 +185,10 @@ def _rotor_air(spec: Multirotor, effects: FlightEffects) -> RotorAir:
 def control_params(spec: Multirotor, air: RotorAir) -> ControlParams:
     """The autopilot of the vehicle file ``spec`` with rotors in ``air``, its rotor allocation worked out."""
     gains, rotor = spec.control, spec.rotor
+    moments, axes = principal_inertia(spec)
     numbers = {
         "mass_kg": spec.mass_kg,
-        "inertia_kg_m2": spec.inertia_kg_m2,
+        "inertia_kg_m2": moments,
         "allocation": np.linalg.pinv(effectiveness(spec)),
         "thrust_coefficient_n_s2": rotor.thrust_coefficient_n_s2,
         "speed_min_rad_s": rotor.speed_min_rad_s,
@@ -184,7 +209,7 @@ def control_params(spec: Multirotor, air: RotorAir) -> ControlParams:
     hover = np.sqrt(GRAVITY_M_S2 * spec.mass_kg / len(spec.rotors) / rotor.thrust_coefficient_n_s2)
     inflow = float(air.inflow_kg_m) * rotor.radius_m * hover
     numbers["climb_damping_1_s"] = 0.5 * len(spec.rotors) * inflow / spec.mass_kg
-    return ControlParams(**_float32(numbers))
+    return ControlParams(**_float32(numbers), principal_axes=None if axes is None else on_device(axes))
 
 
 def effectiveness(spec: Multirotor) -> np.ndarray:
@@ -250,9 +275,14 @@ def wrench(
             jnp.sum(x * across[:, 1] - y * across[:, 0] - params.rotor_spin * shaft_torque),
         ]
     )
+    force = jnp.append(jnp.sum(across, axis=0), jnp.sum(thrust))
+    return airframe_drag(params, air_velocity_m_s) + force, torque
+
+
+def airframe_drag(params: MultirotorParams, air_velocity_m_s: jax.Array) -> jax.Array:
+    """Drag [3] N of the airframe, which moves by ``air_velocity_m_s`` [3] through the air; both body frame."""
     airspeed = jnp.sqrt(jnp.sum(air_velocity_m_s**2) + 1e-12)  # the small term keeps the gradient finite at rest
-    drag = -params.drag_quadratic_kg_m * airspeed * air_velocity_m_s
-    return drag + jnp.append(jnp.sum(across, axis=0), jnp.sum(thrust)), torque
+    return -params.drag_quadratic_kg_m * airspeed * air_velocity_m_s
 
 
 def rotor_momentum(params: MultirotorParams, speed_rad_s: jax.Array) -> jax.Array:
@@ -289,11 +319,12 @@ def multirotor_mjcf(spec: Multirotor, dt: float = 0.005, *, visual: bool = True)
 def free_body_mjcf(
     name: str, mass_kg: float, inertia_kg_m2: Sequence[float], dt: float, shapes: Sequence[str] = ()
 ) -> str:
-    """MJCF of one free body with geometries ``shapes``.
+    """MJCF of one free body with geometries ``shapes``; the inertia as in a vehicle's file, of 3 or 6 numbers.
 
     The options switch off all that a free body has no use for; a sparse Jacobian is what MJX steps fastest here.
     """
     inertia = " ".join(f"{i:.9g}" for i in inertia_kg_m2)
+    which = "diaginertia" if len(inertia_kg_m2) == 3 else "fullinertia"
     lines = "\n".join(shapes)
     return f"""<mujoco model="{name}">
   <option timestep="{dt:.9g}" integrator="Euler" jacobian="sparse" gravity="0 0 {-GRAVITY_M_S2}">
@@ -302,7 +333,7 @@ def free_body_mjcf(
   <worldbody>
     <body name="{name}">
       <freejoint/>
-      <inertial pos="0 0 0" mass="{mass_kg:.9g}" diaginertia="{inertia}"/>
+      <inertial pos="0 0 0" mass="{mass_kg:.9g}" {which}="{inertia}"/>
 {lines}
     </body>
   </worldbody>

@@ -35,19 +35,22 @@ def rover_body(spec: SkidSteer) -> RoverBody:
 
         return read_rover_body(spec.body)
     wheels = spec.wheels
-    x, y = 0.5 * wheels.wheel_base_m, 0.5 * wheels.track_m
+    behind = 0.5 if wheels.castors is None else wheels.castors.load_share
+    ahead, back, y = behind * wheels.wheel_base_m, (1.0 - behind) * wheels.wheel_base_m, 0.5 * wheels.track_m
     chassis_mass = spec.mass_kg - 4.0 * wheels.mass_kg
     height = (chassis_mass * spec.chassis_height_m + 4.0 * wheels.mass_kg * wheels.radius_m) / spec.mass_kg
     hub = wheels.radius_m - height
-    wheel_position = np.array([[x, y, hub], [x, -y, hub], [-x, y, hub], [-x, -y, hub]])
+    wheel_position = np.array([[ahead, y, hub], [ahead, -y, hub], [-back, y, hub], [-back, -y, hub]])
     axle = 0.5 * wheels.mass_kg * wheels.radius_m**2
     across = wheels.mass_kg * (3.0 * wheels.radius_m**2 + wheels.width_m**2) / 12.0
     sides = np.square(spec.chassis_size_m)
     inertia = chassis_mass / 12.0 * np.diag(sides.sum() - sides)
-    inertia += steiner(chassis_mass, np.array([0.0, 0.0, spec.chassis_height_m - height]))
+    offset = -wheels.mass_kg * wheel_position[:, 0].sum() / chassis_mass  # of the box, which the wheels balance
+    inertia += steiner(chassis_mass, np.array([offset, 0.0, spec.chassis_height_m - height]))
     for position in wheel_position:
         inertia += np.diag([across, axle, across]) + steiner(wheels.mass_kg, position)
-    front = max(0.5 * spec.chassis_size_m[0], x + wheels.radius_m)
+    front = max(0.5 * spec.chassis_size_m[0], ahead + wheels.radius_m)
+    rear = max(0.5 * spec.chassis_size_m[0], back + wheels.radius_m)
     side = max(0.5 * spec.chassis_size_m[1], y + 0.5 * wheels.width_m)
     return RoverBody(
         mass_kg=spec.mass_kg,
@@ -57,7 +60,7 @@ def rover_body(spec: SkidSteer) -> RoverBody:
         wheel_width_m=wheels.width_m,
         wheel_mass_kg=wheels.mass_kg,
         wheel_inertia_kg_m2=(axle, across),
-        outline_m=(-front, front, -side, side),
+        outline_m=(-rear, front, -side, side),
     )
 
 

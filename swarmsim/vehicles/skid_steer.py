@@ -3,6 +3,7 @@
 import math
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.vehicles import SkidSteer
@@ -31,8 +32,9 @@ class SkidSteerParams:
     wheel_radius_m: jax.Array  # []
     wheel_width_m: jax.Array  # []
     wheel_inertia_kg_m2: jax.Array  # [] one wheel about its axle
-    rotor_inertia_kg_m2: jax.Array  # [] motor and gears of one wheel, as the wheel feels them
-    friction: jax.Array  # [] Coulomb coefficient between tyre and ground
+    rotor_inertia_kg_m2: jax.Array  # [4] motor and gears of each wheel, as it feels them; 0 of a castor
+    driven: jax.Array  # [4] 1, or 0 of a castor
+    friction: jax.Array  # [4] Coulomb coefficient between tyre and ground
     contact_softness: jax.Array  # [] inverse mass of a wheel's centre (`wheel_inverse_mass`) x the rover's mass
     contact_stiffness_1_s2: jax.Array  # [] k of the reference acceleration -b v - k d r, see `tyre_constants`
     contact_damping_1_s: jax.Array  # [] b of the same, along the normal
@@ -65,6 +67,7 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
     rear, front, right, left = body.outline_m
     stiffness, damping = tyre_constants(spec, body)
     half = 0.5 * np.array(spec.chassis_size_m)
+    driven, friction = wheel_kinds(spec)
     middle = np.array([0.0, 0.0, spec.chassis_height_m - body.wheel_radius_m + body.wheel_position_m[0, 2]])
     values = {
         "mass_kg": body.mass_kg,
@@ -73,8 +76,9 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
         "wheel_radius_m": body.wheel_radius_m,
         "wheel_width_m": body.wheel_width_m,
         "wheel_inertia_kg_m2": body.wheel_inertia_kg_m2[0],
-        "rotor_inertia_kg_m2": spec.motor.rotor_inertia_kg_m2,
-        "friction": spec.wheels.friction,
+        "rotor_inertia_kg_m2": spec.motor.rotor_inertia_kg_m2 * driven,
+        "driven": driven,
+        "friction": friction,
         "contact_softness": wheel_inverse_mass(spec, body) * body.mass_kg,
         "contact_stiffness_1_s2": stiffness,
         "contact_damping_1_s": damping,
@@ -103,6 +107,14 @@ def skid_steer_params(spec: SkidSteer, body: RoverBody | None = None) -> SkidSte
     return SkidSteerParams(**{name: on_device(value) for name, value in values.items()})
 
 
+def wheel_kinds(spec: SkidSteer) -> tuple[np.ndarray, np.ndarray]:
+    """Which wheels are driven [4] (1 or 0), and the friction [4] of each."""
+    castors = spec.wheels.castors
+    if castors is None:
+        return np.ones(4), np.full(4, spec.wheels.friction)
+    return np.array([1.0, 1.0, 0.0, 0.0]), np.array([spec.wheels.friction] * 2 + [castors.friction] * 2)
+
+
 def wheel_spacing(wheel_position_m: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Wheel base [] and track [] (m) of wheels at ``wheel_position_m`` [4, 3]."""
     front_left, front_right, rear_left, rear_right = wheel_position_m
@@ -124,10 +136,25 @@ def effective_track(wheel_position_m: jax.Array) -> jax.Array:
     return track + base * base / track
 
 
+def turning_track(params: SkidSteerParams) -> jax.Array:
+    """Track [] (m) by which wheel speeds turn the rover: `effective_track`, or that of the driven wheels with castors.
+
+    With castors it turns about a point of the driven axle, where no driven wheel has to slip.
+    """
+    _, track = wheel_spacing(params.wheel_position_m)
+    return jnp.where(jnp.min(params.driven) > 0.0, effective_track(params.wheel_position_m), track)
+
+
 def turning_force(params: SkidSteerParams, load_n: jax.Array) -> jax.Array:
-    """Total force [] (N) along the wheels that keeps a rover of weight ``load_n`` [] turning, see `effective_track`."""
+    """Total force [] (N) along the wheels that keeps a rover of weight ``load_n`` [] turning, see `effective_track`.
+
+    With castors, what their friction at the distance of the wheel base takes, at the driven wheels' half track.
+    """
     base, track = wheel_spacing(params.wheel_position_m)
-    return params.friction * load_n * base * jax.lax.rsqrt(base * base + track * track)
+    skid = params.friction[0] * load_n * base * jax.lax.rsqrt(base * base + track * track)
+    share = jnp.mean(params.wheel_position_m[:2, 0]) / base
+    swept = params.friction[2] * share * load_n * base / (0.5 * track)
+    return jnp.where(jnp.min(params.driven) > 0.0, skid, swept)
 
 
 def tyre_sinkage(params: SkidSteerParams) -> jax.Array:
@@ -137,7 +164,7 @@ def tyre_sinkage(params: SkidSteerParams) -> jax.Array:
 
 
 def tyre_creep(params: SkidSteerParams) -> jax.Array:
-    """Slip [] (m/s) at which MuJoCo's regularised friction under a quarter of the weight is fully developed."""
+    """Slip [4] (m/s) at which MuJoCo's regularised friction under a quarter of the weight is fully developed."""
     load_per_mass = 0.25 * params.gravity_m_s2 * params.contact_softness * (1.0 - IMPEDANCE) / IMPEDANCE
     return params.friction * load_per_mass / (FRICTION_RATIO * SLIP_DAMPING_1_S)
 
@@ -148,7 +175,7 @@ def wheel_inverse_mass(spec: SkidSteer, body: RoverBody) -> float:
     mass = np.zeros((10, 10))
     mass[:3, :3], mass[3:6, 3:6] = body.mass_kg * np.eye(3), body.inertia_kg_m2
     mass[4, 6:] = mass[6:, 4] = axle
-    mass[6:, 6:] = (axle + spec.motor.rotor_inertia_kg_m2) * np.eye(4)
+    mass[6:, 6:] = np.diag(axle + spec.motor.rotor_inertia_kg_m2 * wheel_kinds(spec)[0])
     x, y, z = body.wheel_position_m[0]
     jacobian = np.hstack([np.eye(3), [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]], np.zeros((3, 4))])
     return float(np.trace(jacobian @ np.linalg.solve(mass, jacobian.T)) / 3.0)
@@ -173,16 +200,15 @@ def skid_steer_mjcf(spec: SkidSteer, body: RoverBody | None = None, time_step_s:
     """
     body = body or rover_body(spec)
     stiffness, damping = tyre_constants(spec, body)
-    mu = spec.wheels.friction
     # MuJoCo divides a negative solref by the square of the impedance (stiffness) and by the impedance (damping).
     reference = _text(-stiffness * IMPEDANCE**2, -damping * IMPEDANCE)
     contact = (
-        f'condim="3" friction="{mu} {mu} 0 0 0" solref="{reference}" '
+        f'condim="3" solref="{reference}" '
         f'solreffriction="-1 {-SLIP_DAMPING_1_S * IMPEDANCE}" solimp="{IMPEDANCE} {IMPEDANCE} 0.001 0.5 1"'
     )
     geom = 'contype="0" conaffinity="0"'
     planes, wheels, pairs, motors = [], [], [], []
-    for name, position in zip(WHEELS, body.wheel_position_m, strict=True):
+    for name, position, driven, mu in zip(WHEELS, body.wheel_position_m, *wheel_kinds(spec), strict=True):
         planes.append(
             f'<body name="ground_{name}" mocap="true" pos="0 0 {_text(position[2] - body.wheel_radius_m)}">'
             f'<geom name="ground_{name}" type="plane" size="1 1 1" {geom}/></body>'
@@ -190,11 +216,11 @@ def skid_steer_mjcf(spec: SkidSteer, body: RoverBody | None = None, time_step_s:
         axle, across = body.wheel_inertia_kg_m2
         wheels.append(
             f'<body name="{name}" pos="{_text(*position)}">'
-            f'<joint name="{name}" type="hinge" axis="0 1 0" armature="{spec.motor.rotor_inertia_kg_m2}"/>'
+            f'<joint name="{name}" type="hinge" axis="0 1 0" armature="{driven * spec.motor.rotor_inertia_kg_m2}"/>'
             f'<inertial pos="0 0 0" mass="{body.wheel_mass_kg}" diaginertia="{_text(across, axle, across)}"/>'
             f'<geom name="{name}" type="sphere" size="{body.wheel_radius_m}" {geom}/></body>'
         )
-        pairs.append(f'<pair geom1="ground_{name}" geom2="{name}" {contact}/>')
+        pairs.append(f'<pair geom1="ground_{name}" geom2="{name}" friction="{mu} {mu} 0 0 0" {contact}/>')
         motors.append(f'<motor name="{name}" joint="{name}"/>')
     return "\n".join(
         [

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -164,6 +165,7 @@ def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library
     for spec in specs:
         if id(spec) not in params:  # many members share one specification
             params[id(spec)] = _params(scenario, spec, timing)
+    params = dict(zip(params, _alike(list(params.values())), strict=True))
     return Group(
         params=_stack([params[id(spec)] for spec in specs]),
         limits=_limits(specs, [params[id(spec)] for spec in specs], _f32([m.position_m for m in team])),
@@ -173,6 +175,20 @@ def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library
         member=on_host(members, np.int32),
         kind=specs[0].kind,
     )
+
+
+def _alike(params: list[Any]) -> list[Any]:
+    """The same of one structure: principal axes in all of them where those of one are not its body's."""
+    if all(getattr(own, "principal_axes", None) is None for own in params):
+        return params
+    level = _f32([1.0, 0.0, 0.0, 0.0])
+
+    def given(own: Any) -> Any:
+        if own.principal_axes is not None:
+            return own
+        return replace(own, principal_axes=level, control=replace(own.control, principal_axes=level))
+
+    return [given(own) for own in params]
 
 
 def _params(scenario: Scenario, spec: Spec, timing: Timing) -> Any:

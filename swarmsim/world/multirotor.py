@@ -11,6 +11,7 @@ from swarmsim.control.multirotor import ControlMemory, control, is_landed
 from swarmsim.control.multirotor import control_start as controller
 from swarmsim.physics.contact import Plane
 from swarmsim.physics.multirotor import make_multirotor_step, rest_state
+from swarmsim.physics.rigid_body import over_inertia
 from swarmsim.physics.rotations import rotation_matrix, to_body, yaw_of
 from swarmsim.scalars import Layout
 from swarmsim.site import Site, sample, sample_with_gradient
@@ -130,8 +131,8 @@ def jet(params: MultirotorParams, vehicle: MultirotorState) -> tuple[jax.Array, 
 def knocked(params: MultirotorParams, vehicle: MultirotorState, velocity_m_s: jax.Array, spin_nms: jax.Array) -> Any:
     """The vehicle after a change of its velocity [3] and an angular impulse [3] N m s, both world."""
     body = vehicle.body
-    turn = to_body(rotation_matrix(body.quaternion), spin_nms) / params.inertia_kg_m2
-    rate = body.angular_velocity_rad_s + turn
+    spin = to_body(rotation_matrix(body.quaternion), spin_nms)
+    rate = body.angular_velocity_rad_s + over_inertia(params.inertia_kg_m2, params.principal_axes, spin)
     body = replace(body, velocity_m_s=body.velocity_m_s + velocity_m_s, angular_velocity_rad_s=rate)
     return replace(vehicle, body=body)
 

@@ -26,9 +26,10 @@ class Rover:
     def __init__(self, geoms, walls=(), start=(0.0, 0.0, 0.0, 0.0), slope_deg=(0.0, 0.0), spec=SPEC, dt=DT_C):
         self.spec, self.params, body = spec, skid_steer_params(spec), rover_body(spec)
         root = mujoco.MjSpec.from_string(skid_steer_mjcf(spec, time_step_s=dt))
-        tyre = next(pair for pair in root.pairs)
-        contact = {name: getattr(tyre, name) for name in ("condim", "friction", "solref", "solreffriction", "solimp")}
-        contact = {name: np.array(value) if np.ndim(value) else value for name, value in contact.items()}
+        contacts = {}
+        for tyre in root.pairs:
+            said = {name: getattr(tyre, name) for name in ("condim", "friction", "solref", "solreffriction", "solimp")}
+            contacts[tyre.geomname2] = {name: np.array(v) if np.ndim(v) else v for name, v in said.items()}
         for pair in list(root.pairs):
             root.delete(pair)
         chassis = root.body("chassis")
@@ -44,7 +45,7 @@ class Rover:
             root.worldbody.add_geom(name=f"scene{i}", **geom, **off)
         for i in range(len(geoms)):
             for wheel in WHEELS:
-                root.add_pair(geomname1=f"scene{i}", geomname2=wheel, **contact)
+                root.add_pair(geomname1=f"scene{i}", geomname2=wheel, **contacts[wheel])
             root.add_pair(geomname1=f"scene{i}", geomname2="hull", condim=3, friction=[0.4, 0.4, 0, 0, 0])
         for i in range(len(geoms), len(geoms) + len(walls)):
             root.add_pair(geomname1=f"scene{i}", geomname2="bumper", condim=1)
@@ -71,7 +72,7 @@ class Rover:
         poses = []
         for i in range(round(seconds / dt)):
             speed = data.qvel[6:10]
-            wanted = np.clip(gain * (wanted_speed - speed), -most, most)
+            wanted = np.asarray(p.driven) * np.clip(gain * (wanted_speed - speed), -most, most)
             self.torque = wanted + (self.torque - wanted) * keep
             data.ctrl[:] = self.torque - resistance * np.tanh(speed / ROLLING_ONSET_RAD_S)
             mujoco.mj_step(self.model, data)

@@ -43,7 +43,7 @@ def mujoco_cost(acceleration, twist, smooth, distance, normal):
     p = jax.tree.map(lambda x: np.asarray(x, float), PARAMS)
     inverse_mass = wheel_inverse_mass(SPEC, rover_body(SPEC))
     cost = 0.5 * acceleration @ MASS @ acceleration - acceleration @ smooth
-    mu = p.friction / np.sqrt(FRICTION_RATIO)
+    mu = p.friction[0] / np.sqrt(FRICTION_RATIO)
     for wheel in range(4):
         if distance[wheel] >= 0.0:
             continue
@@ -59,7 +59,7 @@ def mujoco_cost(acceleration, twist, smooth, distance, normal):
         reference[0] -= p.contact_stiffness_1_s2 * IMPEDANCE * distance[wheel]
         residual = jacobian @ acceleration - reference
         stiffness = IMPEDANCE / (1.0 - IMPEDANCE) / inverse_mass
-        across, along = residual[0] * mu, p.friction * np.hypot(residual[1], residual[2])
+        across, along = residual[0] * mu, p.friction[0] * np.hypot(residual[1], residual[2])
         if across >= mu * along:
             continue
         if mu * across + along <= 0.0:

@@ -109,7 +109,7 @@ def test_coasts_to_a_stop_by_rolling_resistance(engine):
     free = dataclasses.replace(PARAMS, torque_max_nm=jnp.float32(0.0))
     moving = last(drive(engine, np.full(4, 5.0), 2.0))
     states = drive(engine, np.zeros(4), 1.0, params=free, state=moving)
-    wheels = 4 * float(PARAMS.wheel_inertia_kg_m2 + PARAMS.rotor_inertia_kg_m2) / SPEC.wheels.radius_m**2
+    wheels = 4 * float(PARAMS.wheel_inertia_kg_m2 + PARAMS.rotor_inertia_kg_m2[0]) / SPEC.wheels.radius_m**2
     expected = 0.03 * SPEC.mass_kg * G / (SPEC.mass_kg + wheels)
     speed = states.body.velocity_m_s[:, 0]
     assert float(speed[9] - speed[-1]) / ((len(speed) - 10) * DT) == pytest.approx(expected, rel=0.05)
@@ -159,7 +159,7 @@ def test_the_battery_gives_what_the_motors_do_and_the_avionics_draw(engine):
     states = drive(engine, np.full(4, 5.0), 3.0, params=gentle)
     end = last(states)
     kinetic = 0.5 * SPEC.mass_kg * float(end.body.velocity_m_s[0]) ** 2
-    turning = float(PARAMS.wheel_inertia_kg_m2 + PARAMS.rotor_inertia_kg_m2)
+    turning = float(PARAMS.wheel_inertia_kg_m2 + PARAMS.rotor_inertia_kg_m2[0])
     kinetic += 0.5 * turning * float(jnp.sum(end.wheel_speed_rad_s**2))
     rolled = 0.03 * SPEC.mass_kg * G * float(end.body.position_m[0])
     expected = (kinetic + rolled) / SPEC.battery.drive_efficiency + 3.0 * SPEC.battery.avionics_power_w

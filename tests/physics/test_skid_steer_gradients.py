@@ -30,7 +30,7 @@ def slope():
 
 def reached(engine, params, site, values):
     """Position and heading [4] after 1 s from rest."""
-    params = dataclasses.replace(params, mass_kg=values[7], friction=values[8])
+    params = dataclasses.replace(params, mass_kg=values[7], friction=jnp.full(4, values[8]))
     state = rest_state(params, site, values[4:6], values[6])
 
     def one(state, _):
@@ -76,7 +76,7 @@ TILTS = {"flat": (0.0, 0.0), "slope": (0.12, 0.2)}
 
 def steered(engine, params, site, yaw, values):
     """Position and heading [4] after 1 s at a speed and a yaw rate; values are these, the mass and the friction."""
-    params = dataclasses.replace(params, mass_kg=values[2], friction=values[3])
+    params = dataclasses.replace(params, mass_kg=values[2], friction=jnp.full(4, values[3]))
 
     def one(state, _):
         return STEP[engine](params, state, wheel_speeds(params, values[0], values[1], state), site), None

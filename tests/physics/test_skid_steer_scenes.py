@@ -84,7 +84,7 @@ def test_random_kerbs_met_at_an_angle_end_as_in_mujoco_c():
 def test_a_parked_rover_holds_slides_or_tips_where_mujoco_c_does(degrees, friction, heading, engine):
     spec = SPEC.model_copy(update={"wheels": SPEC.wheels.model_copy(update={"friction": friction})})
     expected = Rover([plane()], start=(0, 0, 0, heading), slope_deg=(degrees, 0.0), spec=spec).drive(np.zeros(4), 1.5)
-    params = dataclasses.replace(PARAMS, friction=jnp.float32(friction))
+    params = dataclasses.replace(PARAMS, friction=jnp.full(4, friction, jnp.float32))
     rise = np.tan(np.radians(degrees))
     states = drive(engine, np.zeros(4), 1.5, plane_site((rise, 0.0)), params=params, yaw=heading)
     up = np.array([-np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))])
@@ -219,10 +219,22 @@ def test_the_engines_agree_on_random_slopes():
     assert apart.max() < 0.2, np.sort(apart)
 
 
-@pytest.mark.parametrize(("command", "rise"), [((-4.0, 4.0, -4.0, 4.0), 0.0), ((6.0,) * 4, 0.05), ((6.0,) * 4, 0.08)])
-def test_a_jackal_moves_as_in_mujoco_c(command, rise):
-    """It turns on the spot within 2 %, passes a kerb of 5 cm and is stopped by one of 8 cm."""
-    spec = SkidSteer(**yaml.safe_load((FILE.parent / "jackal.yaml").read_text()))
+TURN, AHEAD = (-4.0, 4.0, -4.0, 4.0), (6.0,) * 4
+
+
+@pytest.mark.parametrize(
+    ("name", "command", "rise"),
+    [
+        ("jackal", TURN, 0.0),
+        ("jackal", AHEAD, 0.05),
+        ("jackal", AHEAD, 0.08),
+        ("husky", TURN, 0.0),
+        ("husky", AHEAD, 0.08),
+    ],
+)
+def test_a_published_rover_moves_as_in_mujoco_c(name, command, rise):
+    """It turns on the spot within 2 % and passes a kerb of half of its wheel radius; one of 8 cm stops the Jackal."""
+    spec = SkidSteer(**yaml.safe_load((FILE.parent / f"{name}.yaml").read_text()))
     geoms = [plane(), block([1, -20, -1], [20, 20, rise])] if rise else [plane()]
     expected = Rover(geoms, spec=spec).drive(command, 3.0)[-1]
     site = step_site(rise) if rise else plane_site()

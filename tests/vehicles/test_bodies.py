@@ -5,7 +5,8 @@ import pytest
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import BodyFile
-from swarmsim.vehicles.bodies import read_body, read_rover_body
+from swarmsim.vehicles.bodies import read_body, read_rover_body, with_file_body
+from tests.flights import spec_of
 from tests.vehicles.skid_steer_files import ROVER
 
 
@@ -90,3 +91,15 @@ def test_a_missing_file_is_named():
 def test_an_unknown_argument_lists_the_known_ones(tmp_path):
     with pytest.raises(InputError, match=r"unknown xacro argument payloat[\s\S]*payload, radius"):
         read_body(written(tmp_path, payloat=3.0))
+
+
+def test_a_multirotor_takes_the_full_tensor_of_its_file(tmp_path):
+    text = """<robot name="uav"><link name="base_link"><inertial><mass value="2.5"/>
+      <inertia ixx="0.05" iyy="0.06" izz="0.09" ixy="0.01" ixz="{ixz}" iyz="0"/></inertial></link></robot>"""
+    spec = spec_of()
+    tilted = with_file_body(spec.model_copy(update={"body": written(tmp_path, text.format(ixz=-0.005), "tilted.urdf")}))
+    assert tilted.mass_kg == 2.5
+    assert tilted.inertia_kg_m2 == pytest.approx((0.05, 0.06, 0.09, 0.01, -0.005, 0.0))
+    level = text.replace('ixy="0.01"', 'ixy="0"').format(ixz=0)
+    level = with_file_body(spec.model_copy(update={"body": written(tmp_path, level, "level.urdf")}))
+    assert level.inertia_kg_m2 == pytest.approx((0.05, 0.06, 0.09))

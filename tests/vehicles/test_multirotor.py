@@ -204,7 +204,7 @@ def hover_power(name):
     ("name", "measured_w"),
     [
         ("tarot_t650", 4 * 105.4),  # MRS's bench of this drive at 875 g a rotor (ctu-mrs.github.io, motor_tests.md)
-        ("dji_f550", 6 * 38.4),  # the same bench at 333 g
+        ("dji_f550", 6 * 48.1),  # the same bench at 383 g: 51.5 W at 401 g by the power 3/2 of the thrust
         ("x500", 4 * 63.2),  # the same bench, another 10 inch drive at 516 g
         ("crazyflie_2_1", 7.61 - 0.96),  # Bitcraze's thrust investigation at 28 g
         ("ar_drone_2", 60.0 - 5.0),  # 11 min on 11.1 Wh

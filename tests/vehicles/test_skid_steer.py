@@ -59,7 +59,7 @@ def test_sinkage_and_creep_are_those_of_the_specification():
     damping = (
         FRICTION_RATIO * SLIP_DAMPING_1_S * IMPEDANCE / (1 - IMPEDANCE) / wheel_inverse_mass(SPEC, rover_body(SPEC))
     )
-    assert float(tyre_creep(PARAMS)) == pytest.approx(SPEC.wheels.friction * load / damping, rel=1e-5)
+    np.testing.assert_allclose(tyre_creep(PARAMS), SPEC.wheels.friction * load / damping, rtol=1e-5)
 
 
 def test_a_rover_from_a_urdf_takes_its_body_from_there(tmp_path):
