@@ -22,6 +22,8 @@ AIRSPEED_MIN_M_S = 0.5
 GUST_NOISE = 5
 """Numbers of white noise that a step of the filters takes: one along the wind, two across, two up."""
 _WAVES = 4
+GUST_DRAWS = _WAVES * (4 + 2 * GUST_NOISE)
+"""Random numbers that the noise of all vehicles of a mission takes at a step."""
 
 
 @pytree
@@ -63,25 +65,23 @@ def gust_start(noise: jax.Array) -> GustState:
     return GustState(along=noise[0], across=_steady(noise[1:3]), vertical=_steady(noise[3:5]))
 
 
-def gust_noise(key: jax.Array, position_m: jax.Array, lengths_m: jax.Array) -> jax.Array:
-    """White noise [V, `GUST_NOISE`] in time for one `gust_step` of vehicles at ``position_m`` [V, 3], one key a step.
+def gust_noise(draws: jax.Array, position_m: jax.Array, lengths_m: jax.Array) -> jax.Array:
+    """White noise [V, `GUST_NOISE`] in time for one `gust_step` of vehicles at ``position_m`` [V, 3].
 
-    Each vehicle's is standard normal; that of two vehicles r apart has the correlation exp(-r / L), and so have their
-    gusts: that of the Dryden model along the line between them (MIL-F-8785C takes its spectra from it; across, it would
-    be (1 - r / 2 L) exp(-r / L)). L are the ``lengths_m`` [2] (horizontal, vertical) of `gust_scales`. Made of a few
-    waves of random length and direction (Rahimi and Recht, "Random features for large-scale kernel machines", 2007);
-    they are new at every step, so that the correlation over time is exact however few there are.
+    ``draws`` [`GUST_DRAWS`] are standard normal, new at each step and the same for all vehicles of a mission. Each
+    vehicle's noise is standard normal too; that of two vehicles r apart has the correlation exp(-r / L), and so have
+    their gusts: that of the Dryden model along the line between them (MIL-F-8785C takes its spectra from it; across, it
+    would be (1 - r / 2 L) exp(-r / L)). L are the ``lengths_m`` [2] (horizontal, vertical) of `gust_scales`. The noise
+    is made of a few waves of random length and direction (Rahimi and Recht, "Random features for large-scale kernel
+    machines", 2007); as they are new at every step, the correlation over time is exact however few there are.
     """
-    draws = jax.random.normal(key, (_WAVES, 4 + 2 * GUST_NOISE))
+    draws = draws.reshape(_WAVES, 4 + 2 * GUST_NOISE)
     wave = draws[:, :3] / jnp.maximum(jnp.abs(draws[:, 3:4]), 1e-6)  # Cauchy: the spectrum of exp(-r)
-    turns = position_m @ wave.T
-    amplitude = draws[:, 4:].reshape(_WAVES, 2, GUST_NOISE) / _WAVES**0.5
-    level, up = turns / lengths_m[0], turns / lengths_m[1]
-
-    def sum_of(phase: jax.Array, part: slice) -> jax.Array:
-        return jnp.cos(phase) @ amplitude[:, 0, part] + jnp.sin(phase) @ amplitude[:, 1, part]
-
-    return jnp.concatenate([sum_of(level, slice(0, 3)), sum_of(up, slice(3, GUST_NOISE))], axis=-1)
+    turns = jnp.sum(position_m[..., None, :] * wave, axis=-1)  # [V, waves]; sums of few, which no matrix unit rounds
+    length = jnp.stack([lengths_m[0]] * 3 + [lengths_m[1]] * 2)
+    phase = turns[..., None] / length
+    waves = jnp.cos(phase) * draws[:, 4 : 4 + GUST_NOISE] + jnp.sin(phase) * draws[:, 4 + GUST_NOISE :]
+    return jnp.sum(waves, axis=-2) / _WAVES**0.5
 
 
 def gust_step(

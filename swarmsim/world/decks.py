@@ -53,14 +53,22 @@ def _over(
     held = jnp.where(within & (height > -BELOW_M), middle[:, 2], -jnp.inf)
     best = jnp.argmax(held, axis=1)
     over = jnp.isfinite(jnp.max(held, axis=1))
-    arm = jnp.take_along_axis(offset, best[:, None, None], axis=1)[:, 0]
-    deck = jax.tree.map(lambda x: x[best], planes)
-    deck = replace(deck, velocity_m_s=deck.velocity_m_s + jnp.cross(rate[best], arm))
+    one_hot = best[:, None] == jnp.arange(len(middle))  # sums over it fuse, where gathers are a kernel each
+
+    def of_best(each: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(one_hot.reshape(one_hot.shape + (1,) * (each.ndim - 2)), each, 0.0), axis=1)
+
+    there = velocity + jnp.cross(jnp.broadcast_to(rate, offset.shape), offset)
+    deck = Plane(
+        point_m=of_best(planes.point_m[None]),
+        normal=of_best(planes.normal[None]),
+        velocity_m_s=of_best(there),
+    )
 
     def chosen(new: jax.Array, old: jax.Array) -> jax.Array:
         return jnp.where(over.reshape(over.shape + (1,) * (new.ndim - 1)), new, old)
 
     ground = jax.tree.map(chosen, deck, g.around.ground)
-    feet = jnp.take_along_axis(height, best[:, None], axis=1)[:, 0]
+    feet = of_best(height)
     around = replace(g.around, ground=ground, height_m=chosen(feet, g.around.height_m))
     return replace(g, around=replace(around, rides=over & (feet < RIDES_BELOW_M)))

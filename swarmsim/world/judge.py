@@ -6,9 +6,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from swarmsim import randomness
-from swarmsim.physics.wind import GUST_NOISE, gust_noise, gust_scales, gust_step, gust_velocity, steady_wind
+from swarmsim.physics.wind import GUST_DRAWS, gust_noise, gust_scales, gust_step, gust_velocity, steady_wind
 from swarmsim.scalars import over_vehicles
 from swarmsim.site import sample
 from swarmsim.world import events
@@ -32,10 +33,11 @@ def look_around(world: World, state: WorldState, number: jax.Array) -> tuple[Wor
 
     ``number`` [] int32 is the judging period's, which gusts and the radio's losses are drawn for.
     """
-    lengths = gust_scales(world.air.speed_m_s, _flying_height(world, state.groups))[1]
     around = [
-        _refreshed(world, group, state.key, number, lengths, running, g)
-        for running, group, g in zip(state.clock.running, world.groups, state.groups, strict=True)
+        _refreshed(world, group, noise, running, g)
+        for noise, running, group, g in zip(
+            _noise(world, state, number), state.clock.running, world.groups, state.groups, strict=True
+        )
     ]
     groups = tuple(replace(g, around=new) for g, new in zip(state.groups, around, strict=True))
     groups, collided, crowded = in_traffic(world, on_decks(world, groups), state.clock.running)
@@ -86,10 +88,29 @@ def _flying_height(world: World, groups: tuple[GroupState, ...]) -> jax.Array:
     return jnp.sum(jnp.where(known, height, 0.0)) / jnp.maximum(jnp.sum(known), 1)
 
 
-def _refreshed(
-    world: World, group: Group, key: jax.Array, number: jax.Array, lengths_m: jax.Array, running: jax.Array,
-    state: GroupState,
-) -> Surroundings:  # fmt: skip
+def _noise(world: World, state: WorldState, number: jax.Array) -> list[Any]:
+    """White noise of each group's gusts [U, …] and rotors [U, R] in a judging period; None for what does not fly.
+
+    All of it is one draw: on a GPU each costs microseconds, however small it is.
+    """
+    rotors = [KINDS[group.kind].rotors(group.params) if KINDS[group.kind].FLIES else 0 for group in world.groups]
+    flying = [k for k, group in enumerate(world.groups) if KINDS[group.kind].FLIES]
+    if not flying:
+        return [None] * len(world.groups)
+    ends = np.cumsum([GUST_DRAWS, *(group.size * count for group, count in zip(world.groups, rotors, strict=True))])
+    key = jax.random.fold_in(randomness.consumer(state.key, "air"), number)
+    runs = jnp.any(jnp.stack([state.clock.running[k] for k in flying]))
+    size = (int(ends[-1]),)
+    draws = jax.lax.cond(runs, lambda: jax.random.normal(key, size), lambda: jnp.zeros(size))
+    lengths = gust_scales(world.air.speed_m_s, _flying_height(world, state.groups))[1]
+    found: list[Any] = [None] * len(world.groups)
+    for k in flying:
+        motors = draws[ends[k] : ends[k + 1]].reshape(world.groups[k].size, rotors[k])
+        found[k] = gust_noise(draws[:GUST_DRAWS], state.groups[k].vehicle.body.position_m, lengths), motors
+    return found
+
+
+def _refreshed(world: World, group: Group, noise: Any, running: jax.Array, state: GroupState) -> Surroundings:
     """What is around a group's vehicles, with ground, height and wind where they are now if it is running."""
     kind = KINDS[group.kind]
 
@@ -119,17 +140,6 @@ def _refreshed(
     def one(noise: Any, params: Any, limits: Limits, vehicle: Any, around: Surroundings) -> Surroundings:
         return jax.lax.cond(running, anew, lambda *given: given[-1], noise, params, limits, vehicle, around)
 
-    def draw() -> tuple[jax.Array, jax.Array]:
-        gusts = jax.random.fold_in(randomness.consumer(key, "gusts"), number)
-        motors = randomness.per_vehicle(randomness.consumer(key, "motors"), number, group.member)
-        return (
-            gust_noise(gusts, state.vehicle.body.position_m, lengths_m),
-            jax.vmap(lambda k: jax.random.normal(k, (rotors,)))(motors),
-        )
-
-    rotors = kind.rotors(group.params) if kind.FLIES else 0
-    none = jnp.zeros((group.size, GUST_NOISE)), jnp.zeros((group.size, rotors))
-    noise = jax.lax.cond(running, draw, lambda: none) if kind.FLIES else None
     every = over_vehicles(one, layout=world.layout, unroll=1)
     refreshed: Surroundings = every(noise, group.params, group.limits, state.vehicle, state.around)
     return refreshed

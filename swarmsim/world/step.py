@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim import randomness
-from swarmsim.physics.wind import gust_noise, gust_scales, gust_start
+from swarmsim.physics.wind import GUST_DRAWS, gust_noise, gust_scales, gust_start
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import counter_start
@@ -45,7 +45,8 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
     vehicle = jax.vmap(kind.rest, in_axes=(0, None, 0, 0))(group.params, world.site, group.start_m, group.yaw_rad)
     position = vehicle.body.position_m
     size = group.size
-    noise = gust_noise(randomness.consumer(key, "gust start"), position, gust_scales(jnp.zeros(()), jnp.zeros(()))[1])
+    draws = jax.random.normal(randomness.consumer(key, "gust start"), (GUST_DRAWS,))
+    noise = gust_noise(draws, position, gust_scales(jnp.zeros(()), jnp.zeros(()))[1])
     motors = (size, kind.rotors(group.params)) if kind.FLIES else None
     around = Surroundings(
         ground=jax.vmap(ground_below, in_axes=(None, 0))(world.site, position),

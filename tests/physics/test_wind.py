@@ -60,7 +60,8 @@ def test_gusts_of_near_vehicles_are_correlated_as_the_dryden_model_says():
     place = np.array([[0, 0, 0], [10, 0, 0], [0, 0, 20], [40, 40, 0], [600.0, 0, 0]])
 
     def body(state, key):
-        noise = wind.gust_noise(key, jnp.asarray(place, jnp.float32), jnp.asarray(lengths, jnp.float32))
+        draws = jax.random.normal(key, (wind.GUST_DRAWS,))
+        noise = wind.gust_noise(draws, jnp.asarray(place, jnp.float32), jnp.asarray(lengths, jnp.float32))
         return state, noise
 
     _, noise = jax.jit(lambda k: jax.lax.scan(body, 0, k))(jax.random.split(jax.random.key(8), 60_000))
