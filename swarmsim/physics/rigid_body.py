@@ -76,17 +76,18 @@ def _principal_rates_after(
     dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """`rates_after` with all vectors along the principal axes."""
-    kick = dt * torque_nm / inertia_kg_m2
+    inverse = 1.0 / inertia_kg_m2  # of parameters alone, so that a loop of steps divides once
+    kick = dt * torque_nm * inverse
     kicked = rate_rad_s + first * kick
     of_x, of_y, of_z = rotors_nms
     x, y, z = (kicked[axis] * inertia_kg_m2[axis] + rotors_nms[axis] for axis in range(3))  # angular momentum
-    per_x, per_y, per_z = (dt / inertia_kg_m2[axis] for axis in range(3))
+    per_x, per_y, per_z = (dt * inverse[axis] for axis in range(3))
     y, z = _turned(y, z, 0.5 * per_x * (x - of_x))
     z, x = _turned(z, x, 0.5 * per_y * (y - of_y))
     x, y = _turned(x, y, per_z * (z - of_z))
     z, x = _turned(z, x, 0.5 * per_y * (y - of_y))
     y, z = _turned(y, z, 0.5 * per_x * (x - of_x))
-    turned = jnp.stack([x - of_x, y - of_y, z - of_z]) / inertia_kg_m2
+    turned = jnp.stack([x - of_x, y - of_y, z - of_z]) * inverse
     return 0.5 * (kicked + turned), turned + (1.0 - first) * kick
 
 

@@ -231,8 +231,8 @@ def rotor_speeds(
     share = jnp.minimum(1.0, voltage_v / jnp.maximum(params.speed_max_voltage_v, 1e-3))
     inside = jnp.clip(command_rad_s, params.speed_min_rad_s, share * params.speed_max_rad_s)
     target = jnp.where(command_rad_s <= 0.0, 0.0, inside)
-    time_constant = jnp.where(target > speed_rad_s, params.time_constant_up_s, params.time_constant_down_s)
-    return target + (speed_rad_s - target) * jnp.exp(-dt / time_constant)
+    rising, falling = jnp.exp(-dt / params.time_constant_up_s), jnp.exp(-dt / params.time_constant_down_s)
+    return target + (speed_rad_s - target) * jnp.where(target > speed_rad_s, rising, falling)
 
 
 def wrench(

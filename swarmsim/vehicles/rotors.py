@@ -31,15 +31,22 @@ class RotorAir:
     ground_effect: jax.Array  # [] 1, or 0 to leave it out
 
 
-def ground_effect(height_m: jax.Array, radius_m: jax.Array, advance: jax.Array | float = 0.0) -> jax.Array:
-    """Thrust over thrust far from the ground, at equal power, of rotors [...] ``height_m`` above it.
+def ground_gain(
+    height_m: jax.Array,
+    radius_m: jax.Array,
+    induced_m2_s2: jax.Array | float = 1.0,
+    level_m2_s2: jax.Array | float = 0.0,
+) -> jax.Array:
+    """What rotors [...] at ``height_m`` above the ground gain of thrust at equal power, over that far from it.
 
-    Cheeseman and Bennett, "The effect of the ground on a helicopter rotor in forward flight" (ARC R&M 3021, 1955):
-    1 / (1 - (R / 4 z)^2 / (1 + a^2)) with the ``advance`` a, the forward speed over the induced velocity. The height is
-    held above half a radius, where the theory ends: the factor is at most 4/3.
+    Cheeseman and Bennett, "The effect of the ground on a helicopter rotor in forward flight" (ARC R&M 3021, 1955): a
+    thrust 1 / (1 - (R / 4 z)^2 / (1 + V^2 / v^2)) times that far away. The squares of the induced velocity v and of the
+    forward speed V are ``induced_m2_s2`` and ``level_m2_s2``. The height is held above half a radius, where the theory
+    ends: the gain is at most 1/3.
     """
-    ratio = 0.25 * radius_m / jnp.maximum(height_m, GROUND_EFFECT_HEIGHT_MIN * radius_m)
-    return 1.0 / (1.0 - ratio * ratio / (1.0 + advance * advance))
+    height = jnp.maximum(height_m, GROUND_EFFECT_HEIGHT_MIN * radius_m)
+    near = radius_m * radius_m * induced_m2_s2
+    return near / (16.0 * height * height * (induced_m2_s2 + level_m2_s2) - near)
 
 
 def thrusts(
@@ -67,5 +74,5 @@ def thrusts(
     climb = jnp.maximum(hub_m_s[:, 2], -2.0 * hover)
     moving = air.translational_lift_kg_m * spared - air.inflow_kg_m * share * tip * climb
     free = jnp.maximum(thrust_coefficient_n_s2 * speed_rad_s * speed_rad_s + moving, 0.0)
-    advance = jnp.sqrt(level + _STILL_M2_S2) / jnp.maximum(hover, 0.1)
-    return free * (1.0 + air.ground_effect * (ground_effect(height_m, air.radius_m, advance) - 1.0))
+    slow = jnp.maximum(hover * hover, 0.01)
+    return free * (1.0 + air.ground_effect * ground_gain(height_m, air.radius_m, slow, level))

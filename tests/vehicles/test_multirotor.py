@@ -20,7 +20,7 @@ from swarmsim.vehicles.multirotor import (
     rotor_speeds,
     wrench,
 )
-from swarmsim.vehicles.rotors import ground_effect
+from swarmsim.vehicles.rotors import ground_gain
 from tests.flights import GRAVITY, hover_speed, params_of, spec_of
 
 RPM = 2 * np.pi / 60
@@ -128,12 +128,12 @@ def test_motors_saturate_idle_and_disarm():
 
 @pytest.mark.parametrize(("height_in_radii", "factor"), [(0.5, 4 / 3), (1.0, 16 / 15), (2.0, 64 / 63), (1e4, 1.0)])
 def test_ground_effect_is_cheeseman_and_bennett(height_in_radii, factor):
-    assert float(ground_effect(height_in_radii * 0.19, 0.19)) == pytest.approx(factor, rel=1e-6)
+    assert 1 + float(ground_gain(height_in_radii * 0.19, 0.19)) == pytest.approx(factor, rel=1e-6)
 
 
 @given(st.floats(-5.0, 50.0), st.floats(0.05, 1.0))
 def test_ground_effect_is_bounded(height, radius):
-    assert 1.0 <= float(ground_effect(height, radius)) <= 4 / 3 + 1e-6
+    assert 0.0 <= float(ground_gain(height, radius)) <= 1 / 3 + 1e-6
 
 
 @pytest.mark.parametrize("name", ["tarot_t650", "x500"])

@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from swarmsim.config.flight import FlightEffects
 from swarmsim.vehicles.multirotor import LIFT_SLOPE, multirotor_params
-from swarmsim.vehicles.rotors import AIR_DENSITY_KG_M3, ground_effect, thrusts
+from swarmsim.vehicles.rotors import AIR_DENSITY_KG_M3, ground_gain, thrusts
 from tests.flights import PLAIN, hover_speed, params_of, spec_of
 
 FAR = jnp.full(1, 1e3)
@@ -86,8 +86,8 @@ def test_each_effect_can_be_left_out(left_out, hub, height):
 def test_the_ground_is_felt_less_in_forward_flight():
     """Cheeseman and Bennett: at the induced velocity half of the squared ratio."""
     ratio = (0.19 / (4 * 0.3)) ** 2
-    assert float(ground_effect(0.3, 0.19, 0.0)) == pytest.approx(1 / (1 - ratio), rel=1e-5)
-    assert float(ground_effect(0.3, 0.19, 1.0)) == pytest.approx(1 / (1 - 0.5 * ratio), rel=1e-5)
+    assert 1 + float(ground_gain(0.3, 0.19)) == pytest.approx(1 / (1 - ratio), rel=1e-6)
+    assert 1 + float(ground_gain(0.3, 0.19, 4.0, 4.0)) == pytest.approx(1 / (1 - 0.5 * ratio), rel=1e-6)
     low = jnp.full(1, 0.3)
     hover = hover_speed(params_of())
     gain = [thrust("tarot_t650", hover, [v, 0, 0], height=low) / thrust("tarot_t650", hover, [v, 0, 0]) for v in (0, 4)]
