@@ -18,7 +18,7 @@ from swarmsim.results.record import (
     VehicleRecord,
 )
 from swarmsim.versions import package_versions
-from swarmsim.world.events import LOSSES
+from swarmsim.world.events import FAILSAFES, KINDS, LOSSES
 
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "rerun-sdk")
 _ESTIMATE_KEYS = (
@@ -238,6 +238,9 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     row["nuclide"] = named(record.spectrum)
     row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
     row["crashed"] = sum(bool(v.crashed) for v in record.vehicles)
+    saved = {e.vehicle for e in record.events if e.kind in FAILSAFES}
+    row["failsafes"] = sum(v.name in saved for v in record.vehicles)
+    row["incidents"] = ", ".join(f"{e.vehicle}: {e.kind}" for e in record.events if e.kind in KINDS)
     row["energy_wh"] = sum(energy_wh(v) for v in record.vehicles)
     row["success"] = succeeded(record)
     return row
@@ -293,6 +296,7 @@ def batch_summary(rows: Sequence[dict[str, Any]], records: Sequence[MissionRecor
         "seed_last": max(seeds),
         "success_rate": float(np.mean([row["success"] for row in rows])),
         "crashed_vehicles": int(sum(row["crashed"] for row in rows)),
+        "failsafe_vehicles": int(sum(row["failsafes"] for row in rows)),
         "metrics": numbers,
         "real_time_factor": real_time_factor(records, timings),
         "timing": timing_summary(timings),
