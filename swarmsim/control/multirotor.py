@@ -99,7 +99,7 @@ def control(
     thrust = autopilot.mass_kg * jnp.maximum(pull_body[2] + damping, 0.0)
     if isinstance(command, PositionCommand):
         integral = _rate_integral(memory, body, rate, touching, dt)
-        speeds = _rotor_speeds_of(autopilot, body, rate, integral, thrust)
+        speeds = _rotor_speeds_of(autopilot, body, attitude, rate, integral, thrust)
         speeds = jnp.where(stuck >= LANDED_AFTER_S, 0.0, speeds)
         given = _thrust_after(autopilot, memory, speeds, dt)
         return speeds, replace(memory, thrust_m_s2=given, rate_integral_rad_s=integral, stuck_s=stuck)
@@ -108,7 +108,7 @@ def control(
     rate = jnp.where(at_position, rate, wanted)
     thrust = jnp.where(at_position, thrust, jnp.maximum(command.thrust_n, 0.0))
     integral = _rate_integral(memory, body, rate, touching, dt)
-    speeds = _rotor_speeds_of(autopilot, body, rate, integral, thrust)
+    speeds = _rotor_speeds_of(autopilot, body, attitude, rate, integral, thrust)
     speeds = jnp.where(at_position & (stuck >= LANDED_AFTER_S), 0.0, speeds)
     speeds = jnp.where(command.level <= BODY_RATE, speeds, command.rotor_speed_rad_s)
     stuck = jnp.where(at_position, stuck, memory.stuck_s)
@@ -145,13 +145,14 @@ def _observed(
     """The memory with disturbance and velocity of now.
 
     An observer of the velocity with both poles at the root of ``velocity_integral_1_s2``. Its prediction takes the
-    attitude as it is and the thrust that the motors can give, less what the inflow of a climb takes of it, so that
-    neither a step nor a limit winds it up, as they do an integral of the control error. On the ground and with the
-    motors off it waits.
+    attitude as it is and the thrust that the motors can give, less what the inflow of a climb and the rotors' drag take
+    of it, so that neither a step nor a limit winds it up, as they do an integral of the control error. On the ground
+    and with the motors off it waits.
     """
     along = memory.thrust_m_s2 - autopilot.climb_damping_1_s * jnp.sum(attitude[:, 2] * body.velocity_m_s)
     predicted = memory.velocity_m_s + dt * (along * attitude[:, 2] + memory.disturbance_m_s2)
     predicted = predicted - jnp.array([0.0, 0.0, dt * GRAVITY_M_S2], predicted.dtype)
+    predicted = predicted - dt * _rotor_drag(autopilot, body)
     waits = touching | (memory.thrust_m_s2 <= 0.0)
     error = jnp.where(waits, 0.0, body.velocity_m_s - predicted)
     gain = autopilot.velocity_integral_1_s2
@@ -163,13 +164,34 @@ def _observed(
     )
 
 
+def _rotor_drag(autopilot: ControlParams, body: RigidState) -> jax.Array:
+    """Deceleration [3] m/s^2 (world) by the drag of the rotors, as in still air and level flight.
+
+    Left to the observer, it would push a vehicle on after it has stopped.
+    """
+    east, north = autopilot.drag_1_s * body.velocity_m_s[0], autopilot.drag_1_s * body.velocity_m_s[1]
+    return jnp.stack([east, north, jnp.zeros_like(east)])
+
+
 def _rotor_speeds_of(
-    autopilot: ControlParams, body: RigidState, rate: jax.Array, integral: jax.Array, thrust: jax.Array
+    autopilot: ControlParams,
+    body: RigidState,
+    attitude: jax.Array,
+    rate: jax.Array,
+    integral: jax.Array,
+    thrust: jax.Array,
 ) -> jax.Array:
-    """Rotor speeds [R] rad/s for body rates [3] rad/s and a collective thrust [] N."""
+    """Rotor speeds [R] rad/s for body rates [3] rad/s and a collective thrust [] N.
+
+    The moment of the air on the rotors is fed forward as in still air: a small vehicle with slow motors, whose
+    attitude control is weak, would swing over its place. What the wind adds is left to the integral.
+    """
     w, inertia, axes = body.angular_velocity_rad_s, autopilot.inertia_kg_m2, autopilot.principal_axes
     turn = times_inertia(inertia, axes, autopilot.rate_gain_1_s * (rate - w + integral))
-    torque = turn + jnp.cross(w, times_inertia(inertia, axes, w))
+    forward, left = (jnp.sum(attitude[:, axis] * body.velocity_m_s) for axis in (0, 1))
+    drag, rolling = autopilot.drag_moment_ns, autopilot.rolling_moment_ns
+    air = jnp.stack([rolling * forward - drag * left, drag * forward + rolling * left, jnp.zeros_like(forward)])
+    torque = turn + jnp.cross(w, times_inertia(inertia, axes, w)) + air
     return rotor_commands(autopilot, thrust, torque)
 
 
@@ -229,7 +251,7 @@ def _acceleration(
     velocity = _limited(fed + approach, (fastest, climb + CATCH_UP * jnp.minimum(jnp.abs(fed[2]), climb)))
     reach = autopilot.acceleration_max_m_s2
     feedback = setpoint.acceleration_m_s2 + autopilot.velocity_gain_1_s * (velocity - body.velocity_m_s)
-    wanted = _limited(feedback, (reach, reach)) - memory.disturbance_m_s2
+    wanted = _limited(feedback, (reach, reach)) - memory.disturbance_m_s2 + _rotor_drag(autopilot, body)
     lift = jnp.maximum(wanted[2], (LIFT_MIN - 1.0) * GRAVITY_M_S2)
     # Feet on the ground in a landing: upright, and the weight on them, or the wind would tip it over (as PX4 does).
     settles = (touching | (memory.stuck_s > 0.0)) & (velocity[2] < -LANDED_DESCENT_M_S)

@@ -36,6 +36,9 @@ class ControlParams:
     speed_min_rad_s: jax.Array  # [] rad/s
     speed_max_rad_s: jax.Array  # [] rad/s
     rotor_time_constant_s: jax.Array  # [] s, nominal: mean of rising and falling
+    drag_1_s: jax.Array  # [] deceleration by the rotors' drag over the airspeed, nominal
+    drag_moment_ns: jax.Array  # [] moment of the rotors' drag about the centre of mass over the airspeed, nominal
+    rolling_moment_ns: jax.Array  # [] the rotors' rolling moment over the airspeed, nominal
     climb_damping_1_s: jax.Array  # [] deceleration by the rotors' inflow over the speed along their axes, nominal
     position_gain_1_s: jax.Array  # []
     velocity_gain_1_s: jax.Array  # []
@@ -208,6 +211,10 @@ def control_params(spec: Multirotor, air: RotorAir) -> ControlParams:
     }
     hover = np.sqrt(GRAVITY_M_S2 * spec.mass_kg / len(spec.rotors) / rotor.thrust_coefficient_n_s2)
     inflow = float(air.inflow_kg_m) * rotor.radius_m * hover
+    level = len(spec.rotors) * hover
+    numbers["drag_1_s"] = float(air.drag_kg) * level / spec.mass_kg
+    numbers["drag_moment_ns"] = float(np.mean([r.position_m[2] for r in spec.rotors])) * float(air.drag_kg) * level
+    numbers["rolling_moment_ns"] = float(air.rolling_moment_kg_m) * level
     numbers["climb_damping_1_s"] = 0.5 * len(spec.rotors) * inflow / spec.mass_kg
     return ControlParams(**_float32(numbers), principal_axes=None if axes is None else on_device(axes))
 
