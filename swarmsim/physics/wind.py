@@ -4,6 +4,8 @@ Both follow MIL-F-8785C, "Military specification: flying qualities of piloted ai
 3.7.3, low-altitude model. Its formulas are in feet; the functions here take and give SI.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -12,16 +14,19 @@ from swarmsim.pytree import pytree
 FOOT_M = 0.3048
 ROUGHNESS_M = 0.15 * FOOT_M
 """Roughness length of the wind profile for take-off, approach and landing (category C), short vegetation."""
-PROFILE_HEIGHT_M = (3.0 * FOOT_M, 1000.0 * FOOT_M)
-"""Heights between which the profile holds."""
+PROFILE_END_M = 1000.0 * FOOT_M
+"""Height up to which the profile holds."""
 GUST_HEIGHT_M = (10.0 * FOOT_M, 1000.0 * FOOT_M)
 """Heights between which the low-altitude turbulence holds."""
+_PROFILE_AT_GUSTS = math.log(10.0 / 0.15) / math.log(20.0 / 0.15)
 AIRSPEED_MIN_M_S = 0.5
 """Least speed at which the frozen gusts pass by a vehicle that drifts with the wind."""
 
 GUST_NOISE = 5
 """Numbers of white noise that a step of the filters takes: one along the wind, two across, two up."""
 _WAVES = 4
+WAVE_MIN = 0.01
+"""Shortest wave over 2 pi, in lengths of the gusts: nearer vehicles feel the same gust."""
 GUST_DRAWS = _WAVES * (4 + 2 * GUST_NOISE)
 """Random numbers that the noise of all vehicles of a mission takes at a step."""
 
@@ -39,24 +44,32 @@ def steady_wind(speed_m_s: jax.Array, from_rad: jax.Array, height_m: jax.Array) 
     """Air velocity [3] m/s (world ENU) at ``height_m`` above the ground.
 
     ``speed_m_s`` is the wind at 20 ft (6.096 m), ``from_rad`` the bearing that it blows from, clockwise from north as
-    weather stations give it. The profile is logarithmic, ln(h / z0) / ln(20 ft / z0), from 3 ft to 1000 ft; below and
-    above it keeps the value of the end.
+    weather stations give it. The profile is logarithmic, ln(h / z0) / ln(20 ft / z0), up to 1000 ft, where it ends. The
+    specification's begins at 3 ft; what stands or lies on the ground is lower, so that here it goes on to nothing at
+    z0.
     """
-    height = jnp.clip(height_m, *PROFILE_HEIGHT_M)
-    speed = speed_m_s * jnp.log(height / ROUGHNESS_M) / jnp.log(20.0 * FOOT_M / ROUGHNESS_M)
+    speed = speed_m_s * _profile(height_m)
     along = _downwind(from_rad)
     return jnp.stack([speed * along[0], speed * along[1], jnp.zeros_like(speed)])
+
+
+def _profile(height_m: jax.Array) -> jax.Array:
+    """Wind [] at a height [] m over that at 20 ft."""
+    height = jnp.clip(height_m, ROUGHNESS_M, PROFILE_END_M)
+    return jnp.log(height / ROUGHNESS_M) / math.log(20.0 * FOOT_M / ROUGHNESS_M)
 
 
 def gust_scales(speed_m_s: jax.Array, height_m: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Standard deviations [2] m/s and lengths [2] m of the gusts, each (horizontal, vertical).
 
     With h in feet from 10 to 1000: L_w = h, L_u = L_v = h / (0.177 + 0.000823 h)^1.2, sigma_w = 0.1 W_20,
-    sigma_u = sigma_v = sigma_w / (0.177 + 0.000823 h)^0.4.
+    sigma_u = sigma_v = sigma_w / (0.177 + 0.000823 h)^0.4. Below 10 ft, where the specification ends, the gusts get
+    weaker with the wind.
     """
     height = jnp.clip(height_m, *GUST_HEIGHT_M)
+    calmer = jnp.minimum(1.0, _profile(height_m) / _PROFILE_AT_GUSTS)
     ratio = 0.177 + 0.000823 * height / FOOT_M
-    vertical = 0.1 * speed_m_s * jnp.ones_like(height)
+    vertical = 0.1 * speed_m_s * calmer
     return jnp.stack([vertical / ratio**0.4, vertical]), jnp.stack([height / ratio**1.2, height])
 
 
@@ -75,9 +88,13 @@ def gust_noise(draws: jax.Array, position_m: jax.Array, lengths_m: jax.Array) ->
     is made of a few waves of random length and direction (Rahimi and Recht, "Random features for large-scale kernel
     machines", 2007); as they are new at every step, the correlation over time is exact however few there are.
     """
-    draws = draws.reshape(_WAVES, 4 + 2 * GUST_NOISE)
-    wave = draws[:, :3] / jnp.maximum(jnp.abs(draws[:, 3:4]), 1e-6)  # Cauchy: the spectrum of exp(-r)
-    turns = jnp.sum(position_m[..., None, :] * wave, axis=-1)  # [V, waves]; sums of few, which no matrix unit rounds
+    draws, position = draws.reshape(_WAVES, 4 + 2 * GUST_NOISE), jax.lax.stop_gradient(position_m)
+    # Cauchy, the spectrum of exp(-r); bounded, so that the rounding of a position is not felt. A gust has no gradient
+    # by place, as white noise has none by time.
+    wave = draws[:, :3] / jnp.maximum(
+        jnp.abs(draws[:, 3:4]), WAVE_MIN * jnp.max(jnp.abs(draws[:, :3]), axis=1, keepdims=True)
+    )
+    turns = jnp.sum(position[..., None, :] * wave, axis=-1)  # [V, waves]; sums of few, which no matrix unit rounds
     length = jnp.stack([lengths_m[0]] * 3 + [lengths_m[1]] * 2)
     phase = turns[..., None] / length
     waves = jnp.cos(phase) * draws[:, 4 : 4 + GUST_NOISE] + jnp.sin(phase) * draws[:, 4 + GUST_NOISE :]

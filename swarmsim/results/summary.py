@@ -251,12 +251,14 @@ def _axes(name: str, values: list[float] | None, axes: tuple[str, ...]) -> dict[
 
 
 def succeeded(record: MissionRecord) -> bool:
-    """Whether the mission did what it was for: nobody crashed, no phase ran out of time, and the answer is right.
+    """Whether the mission did what it was for: no crash, no failsafe, no phase out of time, and the answer is right.
 
     Right is a source located and, where the mission identifies nuclides, the nuclide of the nearest true source named;
     or, where there is no source, none located. A mission that looks for nothing has no answer to give.
     """
     if any(v.crashed for v in record.vehicles) or not all(phase.in_time for phase in record.phases):
+        return False
+    if any(event.kind in FAILSAFES for event in record.events):
         return False
     if record.sought == "nothing":
         return True

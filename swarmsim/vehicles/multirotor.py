@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from swarmsim.config.errors import InputError
 from swarmsim.config.flight import FlightEffects
 from swarmsim.config.vehicles import Multirotor, RotorModel, inertia_tensor
 from swarmsim.pytree import on_device, pytree
@@ -372,4 +373,7 @@ def _spins(spec: Multirotor) -> np.ndarray:
 
 
 def _float32(numbers: dict[str, Any]) -> dict[str, jax.Array]:
+    for name, number in numbers.items():
+        if not np.all(np.abs(np.asarray(number, np.float64)) < 1e30):
+            raise InputError.of(f"{name} is too large for a vehicle", given=str(number))
     return {name: on_device(number) for name, number in numbers.items()}

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from swarmsim.config.checks import footprint_radius_m
 from swarmsim.config.errors import InputError
 from swarmsim.config.flight import Failsafe
-from swarmsim.config.mission import Mission
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.physics.multirotor import check_time_step
@@ -85,7 +84,7 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
             separation_m=_f32(mission.traffic.separation_m),
             ground_separation_m=_f32(mission.traffic.ground_separation_m),
         ),
-        failsafes=_failsafes(mission, site),
+        failsafes=_failsafes(scenario, site),
         radio=Radio(
             range_m=_f32(radio.range_m if radio.range_m is not None else np.inf),
             loss=_f32(radio.loss),
@@ -98,14 +97,22 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
     )
 
 
-def _failsafes(mission: Mission, site: Site) -> FailsafeRules:
-    rules = mission.failsafes
+def _failsafes(scenario: Scenario, site: Site) -> FailsafeRules:
+    rules = scenario.mission.failsafes
     origin = np.asarray(site.origin_m, np.float64)
     rows, columns = np.shape(site.terrain_m)
     end = origin + float(site.cell_m) * (np.array([columns, rows]) - 1)
     kinds: list[Failsafe] = [rules.fence, rules.wind, rules.battery, rules.link]
     fence, wind, battery, link = (kind.action != "none" for kind in kinds)
     margin = rules.fence.margin_m if fence else -NOWHERE_M
+    flying = [m.position_m for m, v in zip(scenario.members, scenario.vehicles, strict=True) if v.kind == "multirotor"]
+    starts = np.array(flying).reshape(-1, 2)
+    if np.any((starts < origin + margin) | (starts > end - margin)):
+        raise InputError.of(
+            "a vehicle starts outside the fence, which is the site's outline less failsafes.fence.margin_m",
+            given=f"a margin of {margin:g} m",
+            suggestion="make the margin smaller, or set failsafes.fence.action to none",
+        )
     return FailsafeRules(
         fence_low_m=_f32(origin + margin),
         fence_high_m=_f32(end - margin),

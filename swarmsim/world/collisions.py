@@ -27,6 +27,7 @@ class Bodies:
 
     position_m: jax.Array  # [V, 3] world, middle of the cylinder
     velocity_m_s: jax.Array  # [V, 3] world
+    rate_rad_s: jax.Array  # [V, 3] world
     radius_m: jax.Array  # [V]
     half_height_m: jax.Array  # [V]
     mass_kg: jax.Array  # [V] inf: does not give way
@@ -64,14 +65,18 @@ def collide(bodies: Bodies, near: Candidates, dt: float) -> Collisions:
     inside = begin <= 0.0
     level = norm(at[..., :2])
     beside = reach - level < tall - jnp.abs(at[..., 2])  # of two that overlap already: the shorter way out
-    upright = jnp.where(inside, ~beside, top_from > rim_from)
-    normal = _normal(at, level, upright)
-    both_fly = bodies.flies[:, None] & of(bodies.flies)
+    flies = bodies.flies[:, None], of(bodies.flies)
+    both_fly, none_flies = flies[0] & flies[1], ~(flies[0] | flies[1])
+    upright = jnp.where(inside, ~beside, top_from > rim_from) & ~none_flies
+    number = jnp.arange(len(bodies.mass_kg))
+    normal = _normal(at, level, upright, jnp.sign(number[:, None] - of(number)).astype(jnp.float32))
     meets &= ~(upright & ~both_fly) & (bodies.active[:, None] | of(bodies.active))
     depth = jnp.where(inside, jnp.where(upright, tall - jnp.abs(at[..., 2]), reach - level), 0.0)
     radius, half = bodies.radius_m, bodies.half_height_m
     arm = _arm(radius[:, None], half[:, None], of(half), at, normal, upright)
     others = _arm(of(radius), of(half), half[:, None], -at, -normal, upright)
+    # Of the points that touch: what spins already is not turned on and on by what it lies on.
+    closing = closing + jnp.cross(bodies.rate_rad_s[:, None], arm) - jnp.cross(of(bodies.rate_rad_s), others)
     impulse = _impulses(bodies, near, meets, closing, normal, (arm, others), jnp.maximum(depth - TOUCH_M, 0.0))
     touched = meets & (jnp.sum(impulse * impulse, axis=-1) > 0.0)
     number = jnp.sum(touched, axis=1).astype(jnp.float32)
@@ -111,11 +116,17 @@ def _heights_overlap(apart: jax.Array, closing: jax.Array, tall: jax.Array) -> t
     return first, last
 
 
-def _normal(at: jax.Array, level: jax.Array, upright: jax.Array) -> jax.Array:
-    """Unit vector [V, C, 3] from the other one; exactly opposite for the two of a pair."""
-    side = at[..., :2] / jnp.maximum(level, 1e-6)[..., None]
+def _normal(at: jax.Array, level: jax.Array, upright: jax.Array, order: jax.Array) -> jax.Array:
+    """Unit vector [V, C, 3] from the other one; exactly opposite for the two of a pair.
+
+    Two in one place are parted along the east or upwards, by their ``order`` [V, C], 1 or -1.
+    """
+    apart = (level > 1e-6)[..., None]
+    side = jnp.where(apart, at[..., :2] / jnp.maximum(level, 1e-6)[..., None], 0.0)
+    side = jnp.where(apart, side, order[..., None] * jnp.array([1.0, 0.0]))
     flat = jnp.concatenate([side, jnp.zeros_like(level)[..., None]], axis=-1)
-    up = jnp.stack([jnp.zeros_like(level), jnp.zeros_like(level), jnp.sign(at[..., 2])], axis=-1)
+    over = jnp.where(at[..., 2] == 0.0, order, jnp.sign(at[..., 2]))
+    up = jnp.stack([jnp.zeros_like(level), jnp.zeros_like(level), over], axis=-1)
     return jnp.where(upright[..., None], up, flat)
 
 

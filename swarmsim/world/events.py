@@ -19,7 +19,7 @@ DESCRIPTIONS = {
     "battery_empty": "used up its battery",
     "non_finite": "had a non-finite state, and was stopped at its last finite one",
     "fence": "failsafe: was about to leave the fence",
-    "wind": "failsafe: the wind was nearly all that it can hold against",
+    "wind": "failsafe: the air carried it off although it did nearly all that it can",
     "battery_low": "failsafe: its battery was low",
     "link_lost": "failsafe: it lost the link to the ground station",
 }

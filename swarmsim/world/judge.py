@@ -24,6 +24,8 @@ from swarmsim.world.traffic import in_traffic
 
 MOTOR_NOISE_S = 0.1
 """Correlation time of the errors of rotors' speeds: an estimate of how fast motor controllers hunt."""
+AT_REST_M_S = 0.05
+"""Speed below which a vehicle that a failsafe has landed has come to rest."""
 AIRBORNE_M = 0.5
 """Height of its feet above which a multirotor's failsafes are on."""
 
@@ -73,7 +75,8 @@ def record_events(
     active = state.active
     if rescue is not None:
         rescue = rescue_of(world.failsafes, rescue, times, body.position_m, height, world.site, limits.home_m)
-        active = active & ~(events.rescued(times) & kind.landed(state.control))
+        still = jnp.sum(body.velocity_m_s**2) < AT_REST_M_S**2  # it may slide on a little with its motors off
+        active = active & ~(events.rescued(times) & kind.landed(state.control) & still)
     around = replace(state.around, rescue=rescue)
     return replace(state, event_time_s=times, around=around, active=active, impact_m_s=jnp.zeros_like(impact))
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim.physics.rotations import rotate
 from swarmsim.pytree import pytree
 from swarmsim.world import events
 from swarmsim.world.collisions import Bodies, collide
@@ -50,6 +51,7 @@ def in_traffic(world: World, groups: Groups, running: jax.Array) -> tuple[Groups
         Bodies(
             position_m=fleet.position_m,
             velocity_m_s=fleet.velocity_m_s,
+            rate_rad_s=_rates(groups, fleet),
             radius_m=fleet.radius_m,
             half_height_m=fleet.half_height_m,
             mass_kg=jnp.where(fleet.active, mass, jnp.inf),
@@ -64,7 +66,7 @@ def in_traffic(world: World, groups: Groups, running: jax.Array) -> tuple[Groups
     craft = Rotorcraft(
         position_m=fleet.position_m,
         velocity_m_s=fleet.velocity_m_s,
-        wind_m_s=wind,
+        wind_m_s=jnp.where(fleet.usable[:, None], wind, 0.0),
         thrust_n=fleet.thrust_n,
         span_m=fleet.span_m,
     )
@@ -88,6 +90,13 @@ def in_traffic(world: World, groups: Groups, running: jax.Array) -> tuple[Groups
         collided.append(met.hit[part] & fleet.active[part])
         first += group.size
     return tuple(told), collided, traffic.overflow
+
+
+def _rates(groups: Groups, fleet: _Fleet) -> jax.Array:
+    """Turn rates [V, 3] rad/s, world, of those that are stepped."""
+    bodies = [g.vehicle.body for g in groups]
+    rate = jnp.concatenate([rotate(b.quaternion, b.angular_velocity_rad_s) for b in bodies])
+    return jnp.where(jnp.isfinite(rate) & (fleet.usable & fleet.active)[:, None], rate, 0.0)
 
 
 def _least_inertia(inertia: jax.Array) -> jax.Array:

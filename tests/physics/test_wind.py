@@ -14,7 +14,12 @@ def test_profile_is_logarithmic_and_anchored_at_20_ft():
     at = lambda h: float(jnp.linalg.norm(wind.steady_wind(5.0, 0.3, h)))  # noqa: E731 - one line, used thrice
     assert at(20 * FOOT) == pytest.approx(5.0, rel=1e-6)
     assert at(20.0) == pytest.approx(5.0 * np.log(20.0 / (0.15 * FOOT)) / np.log(20 / 0.15), rel=1e-5)
-    assert at(0.0) == at(-3.0) == pytest.approx(5.0 * np.log(3 / 0.15) / np.log(20 / 0.15), rel=1e-5)
+    assert at(3 * FOOT) == pytest.approx(5.0 * np.log(3 / 0.15) / np.log(20 / 0.15), rel=1e-5)
+    assert at(0.15 * FOOT) == at(0.0) == at(-3.0) == 0.0  # what lies on the ground
+    calm, length = wind.gust_scales(10.0, 0.05)
+    gusty, same = wind.gust_scales(10.0, 10 * FOOT)
+    assert (np.asarray(calm) < 0.05 * np.asarray(gusty)).all()
+    np.testing.assert_array_equal(length, same)
 
 
 @pytest.mark.parametrize(

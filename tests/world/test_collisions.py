@@ -20,11 +20,12 @@ HALF_M = 0.15
 INERTIA = 0.02
 
 
-def bodies(position, velocity, mass=None, flies=None, active=None):
+def bodies(position, velocity, mass=None, flies=None, active=None, rate=None):
     count = len(position)
     return Bodies(
         position_m=jnp.asarray(position, jnp.float32),
         velocity_m_s=jnp.asarray(velocity, jnp.float32),
+        rate_rad_s=jnp.asarray(np.zeros((count, 3)) if rate is None else rate, jnp.float32),
         radius_m=jnp.full(count, 0.4),
         half_height_m=jnp.full(count, HALF_M),
         inertia_kg_m2=jnp.full(count, INERTIA),
@@ -59,6 +60,31 @@ def test_momentum_is_conserved_and_nobody_gains_energy(dense_max):
         assert gained < pushed
         touched += int(np.asarray(result.hit).sum())
     assert 200 < touched < 1000
+
+
+@pytest.mark.parametrize("spin", [1.0, 5.0, 15.0])
+def test_spinning_pairs_that_touch_gain_no_energy(spin):
+    draw = np.random.default_rng(6)
+    touched = 0
+    for _ in range(400):
+        place = np.array([[0, 0, 5.0], [0.83, 0, 5.0]]) + draw.normal(0, 0.02, (2, 3)) * [0, 1, 3]
+        speed, rate = draw.normal(0, 1, (2, 3)), draw.normal(0, spin, (2, 3))
+        result = met(bodies(place, speed, rate=rate))
+        after, spun = speed + np.asarray(result.velocity_m_s), rate + np.asarray(result.spin_nms) / INERTIA
+        energy = lambda v, w: 0.5 * (v**2).sum() + 0.5 * INERTIA * (w**2).sum()  # noqa: E731
+        assert energy(after, spun) - energy(speed, rate) < 1e-4 * energy(speed, rate)
+        touched += int(np.any(result.velocity_m_s))
+    assert touched > 50
+
+
+def test_two_in_one_place_are_parted():
+    for flies in (True, False):
+        result = met(bodies([[1.0, 2, 5], [1.0, 2, 5]], np.zeros((2, 3)), flies=[flies, flies]))
+        assert np.linalg.norm(result.velocity_m_s, axis=1).min() > 0.3
+        np.testing.assert_allclose(np.asarray(result.velocity_m_s).sum(0), 0.0, atol=1e-6)
+    rovers = met(bodies([[0, 0, 0.2], [0.2, 0, 0.2]], np.zeros((2, 3)), flies=[False, False]))
+    assert rovers.hit.all()
+    assert rovers.velocity_m_s[0, 0] < 0 < rovers.velocity_m_s[1, 0]
 
 
 @pytest.mark.parametrize("speed", [0.5, 5.0, 25.0])
@@ -142,6 +168,19 @@ def test_uavs_that_fly_into_each_other_fall_apart(place):
     assert all("vehicle" in kinds for kinds in happened(state)), happened(state)
     assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.05  # they lie on the ground
     assert tracks[0].position_m[-1, :, 2].max() < 0.5
+
+
+def test_one_that_lies_on_another_comes_to_rest(place):
+    """Dropped on one another with motors off: they neither spin up nor gain energy, and end beside each other."""
+    made, start = place
+    at = np.array(start.groups[0].vehicle.body.position_m)
+    at[1] = at[0] + [0.1, 0.0, 1.0]
+    spin = start.groups[0].vehicle
+    body = replace(spin.body, position_m=jnp.asarray(at))
+    _, tracks = fly(made, with_group(start, 0, vehicle=replace(spin, body=body)), (OFF, stay(made, start)[1]), 8.0)
+    rate = np.linalg.norm(tracks[0].angular_velocity_rad_s[-1], axis=-1)
+    assert rate.max() < 0.5
+    assert np.linalg.norm(tracks[0].velocity_m_s[-1], axis=-1).max() < 0.2
 
 
 def test_rovers_that_meet_stop_outside_each_other(place):
