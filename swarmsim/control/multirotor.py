@@ -300,10 +300,7 @@ def _stuck(stuck_s: jax.Array, climb_m_s: jax.Array, still: jax.Array, dt: float
     return jnp.where(climb_m_s > LANDED_DESCENT_M_S, 0.0, kept)
 
 
-Limit = jax.Array | float
-
-
-def _limited(v: jax.Array, limits: tuple[Limit, Limit]) -> jax.Array:
+def _limited(v: jax.Array, limits: tuple[jax.Array | float, jax.Array | float]) -> jax.Array:
     """Vector ``v`` [3] with its horizontal length and its height held to the two ``limits``."""
     length = jnp.sqrt(v[0] * v[0] + v[1] * v[1] + 1e-12)
     share = jnp.minimum(1.0, limits[0] / length)

@@ -57,7 +57,7 @@ def downwash(craft: Rotorcraft, near: Candidates) -> jax.Array:
     depth, origin = jnp.where(blows, below[..., 2], 0.0), ORIGIN * jnp.where(blows, span, 1.0)
     length = depth + origin
     age = 0.5 * (length * length - origin * origin) / jnp.where(blows, flow, 1.0)
-    aside = below[..., :2] + age[..., None] * of(drift)
+    aside = jnp.where(blows[..., None], below[..., :2] + age[..., None] * of(drift), 0.0)
     own = 0.25 * craft.span_m * craft.span_m  # its rotors are this far from its middle, squared
     square = (jnp.sum(aside * aside, axis=-1) + own[:, None]) / (SPREAD * SPREAD * length * length)
     speed = jnp.where(blows, flow, 0.0) / (length * (1.0 + _SHAPE * square) ** 2)

@@ -17,7 +17,7 @@ from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import World
 from swarmsim.world.neighbours import DENSE_MAX, WINDOW, Candidates, candidates, cleared, norm
 from swarmsim.world.right_of_way import Traffic, kept_aside, reach_of, right_of_way
-from swarmsim.world.state import GroupState
+from swarmsim.world.state import GroupState, moving
 
 Groups = tuple[GroupState, ...]
 
@@ -113,6 +113,7 @@ def _fleet(world: World, groups: Groups) -> _Fleet:
         jax.vmap(KINDS[group.kind].jet)(group.params, g.vehicle) for group, g in zip(world.groups, groups, strict=True)
     ]
     thrust, span = (jnp.concatenate(x) for x in zip(*jets, strict=True))
+    stepped = jnp.concatenate([moving(g) for g in groups])
     return _Fleet(
         position_m=place,
         velocity_m_s=jnp.where(usable[:, None], velocity, 0.0),
@@ -121,7 +122,7 @@ def _fleet(world: World, groups: Groups) -> _Fleet:
         active=jnp.concatenate([g.active for g in groups]),
         radius_m=jnp.concatenate([group.limits.radius_m for group in world.groups]),
         half_height_m=jnp.concatenate([group.limits.half_height_m for group in world.groups]),
-        thrust_n=jnp.where(usable, thrust, 0.0),
+        thrust_n=jnp.where(usable & stepped, thrust, 0.0),  # one that only rests keeps the rotor speeds it had
         span_m=span,
     )
 

@@ -81,6 +81,21 @@ def test_gusts_of_near_vehicles_are_correlated_as_the_dryden_model_says():
     np.testing.assert_allclose(between, np.eye(5), atol=0.02)
 
 
+def test_rounding_of_a_place_is_not_felt_and_gusts_have_no_gradient_by_place():
+    lengths = jnp.array([60.0, 20.0])
+    place = jnp.array([[200.0, 150.0, 30.0]])
+
+    def noise(key, at):
+        return wind.gust_noise(jax.random.normal(key, (wind.GUST_DRAWS,)), at, lengths)
+
+    keys = jax.random.split(jax.random.key(4), 3000)
+    near = place * (1.0 + 1.2e-7)
+    apart = jnp.abs(jax.vmap(noise, (0, None))(keys, near) - jax.vmap(noise, (0, None))(keys, place))
+    assert float(apart.max()) < 2e-3
+    slope = jax.grad(lambda at: jnp.sum(noise(keys[0], at)))(place)
+    np.testing.assert_array_equal(slope, 0.0)
+
+
 def test_gusts_have_the_dryden_variance_and_correlation():
     airspeed, height, dt = 10.0, 30.0, 0.1
     series, (long, short) = _series(dt, 400, 2000, airspeed, height)

@@ -204,6 +204,22 @@ def test_success_means_located_named_in_time_and_nobody_crashed(found: MissionRe
     assert not succeeded(dataclasses.replace(found, phases=(found.phases[0], late)))
 
 
+def test_a_failsafe_is_no_success_and_a_batch_tells_of_it(found: MissionRecord) -> None:
+    events = (
+        Event(3.0, "uav1", "fence", ""),
+        Event(4.0, "uav1", "wind", ""),
+        Event(5.0, "uav2", "crash", ""),
+        Event(6.0, "uav3", "finished", ""),
+    )
+    saved = dataclasses.replace(found, events=events[:1])
+    assert not succeeded(saved)
+    records = [found, saved, dataclasses.replace(found, events=events)]
+    rows = [batch_row(record) for record in records]
+    assert [row["failsafes"] for row in rows] == [0, 1, 1]
+    assert [row["incidents"] for row in rows] == ["", "uav1: fence", "uav1: fence, uav1: wind, uav2: crash"]
+    assert batch_summary(rows, records, TIMINGS)["failsafe_vehicles"] == 2
+
+
 def test_success_asks_for_no_more_than_was_sought(found: MissionRecord) -> None:
     unnamed = dataclasses.replace(found, spectrum=None, sought="source")
     assert succeeded(unnamed)

@@ -12,11 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import Multirotor
 from swarmsim.vehicles.multirotor import (
     battery_power,
     effectiveness,
     multirotor_mjcf,
+    multirotor_params,
     rotor_speeds,
     wrench,
 )
@@ -230,3 +232,9 @@ def test_mjcf_is_the_body_of_the_spec(name, visual):
     assert model.body_mass[1] == pytest.approx(spec.mass_kg)
     np.testing.assert_allclose(model.body_inertia[1], spec.inertia_kg_m2, rtol=1e-6)
     assert (model.ngeom > 0) == visual
+
+
+def test_a_number_that_float32_cannot_hold_is_told():
+    heavy = spec_of("x500").model_copy(update={"inertia_kg_m2": (1e300, 1e300, 1e300)})
+    with pytest.raises(InputError, match="inertia_kg_m2 is too large"):
+        multirotor_params(heavy)

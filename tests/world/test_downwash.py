@@ -1,5 +1,7 @@
 """Downwash: a jet's momentum, a published loss of lift, the wind that carries it along, and flights below others."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ from swarmsim.control.commands import go_to
 from swarmsim.vehicles.rotors import AIR_DENSITY_KG_M3, thrusts
 from swarmsim.world.downwash import DECAY, DEPTH_MAX, ORIGIN, REACH_MAX, SPREAD, Rotorcraft, downwash
 from swarmsim.world.neighbours import candidates
+from swarmsim.world.traffic import in_traffic
 from tests.flights import hover_speed, params_of
 from tests.world.worlds import airborne, begin, fly, happened, row, world
 
@@ -121,6 +124,29 @@ def air_at_all(places):
         span_m=jnp.full(count, SPAN),
     )
     return np.asarray(downwash(craft, candidates(place, every, every, jnp.float32(5.0), 48, 256)))
+
+
+def test_a_vehicle_without_numbers_takes_the_downwash_from_nobody():
+    place = jnp.array([[0, 0, 0.0], [0, 0, 2.0], [0, 1.0, 4.0]])
+    every = jnp.array([True, True, False])
+    still = {"position_m": place, "velocity_m_s": jnp.zeros((3, 3)), "span_m": jnp.full(3, SPAN)}
+    craft = Rotorcraft(
+        thrust_n=jnp.array([THRUST, THRUST, 0.0]), wind_m_s=jnp.zeros((3, 3)).at[2].set(jnp.nan), **still
+    )
+    felt = downwash(craft, candidates(place, every, every, jnp.float32(5.0), 48, 256))
+    assert felt[0] == pytest.approx(air_at([0, 0, -2.0])[0, 1], rel=1e-5)
+
+
+def test_one_that_has_no_part_any_more_blows_at_nobody():
+    team = row("uav", "x500", 2, (-20.0, -15.0), spacing_m=9.0)
+    made = world(team, blocks=(), sample_period_s={"nai_1p5x1p5": 1.0}, wind={"speed_m_s": 0.0, "gusts": False})
+    places = np.array([[-20.0, -15.0, 10.0], [-20.0, -15.0, 8.0]], np.float32)
+    state = airborne(made, begin(made, jax.random.key(5)), places)
+    running = jnp.ones(1, bool)
+    for part, air in ((True, 4.4), (False, 0.0)):
+        g = replace(state.groups[0], active=jnp.array([part, True]))
+        groups, _, _ = in_traffic(made, (g,), running)
+        assert -float(groups[0].around.wind_m_s[1, 2]) == pytest.approx(air, abs=0.5)
 
 
 @pytest.mark.parametrize("on", [True, False])

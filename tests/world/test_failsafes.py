@@ -7,8 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmsim.config.errors import InputError
 from swarmsim.control.commands import fly_velocity, go_to
 from swarmsim.world import events
+from swarmsim.world.judge import record_events
 from tests.world.worlds import airborne, begin, fly, happened, row, with_group, world
 
 COUNT = 4
@@ -113,6 +115,30 @@ def test_too_strong_a_wind_makes_it_land_where_it_is(speed):
     low = tracks[0].position_m[-1]
     assert (low[:, 2] < 0.3).all()
     assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.05
+
+
+def test_a_fence_that_shuts_out_a_start_is_told():
+    team = row("uav", "x500", 2, (-38.0, -15.0))
+    with pytest.raises(InputError, match="starts outside the fence"):
+        world(team, failsafes={"fence": {"margin_m": 3.0}})
+    world(team, failsafes={"fence": {"margin_m": 1.0}})
+    world(team, failsafes={"fence": {"action": "none", "margin_m": 3.0}})
+    world(row("rover", "orpheus", 1, (-38.0, 0.0)), failsafes={"fence": {"margin_m": 3.0}})  # rovers have none
+
+
+@pytest.mark.parametrize("slides", [True, False])
+def test_one_that_has_landed_comes_to_rest_before_its_part_ends(place, slides):
+    made, start = place
+    g = start.groups[0]
+    times = g.event_time_s.at[0, events.WIND].set(1.0)
+    body = replace(g.vehicle.body, velocity_m_s=g.vehicle.body.velocity_m_s.at[0, 0].set(0.4 if slides else 0.0))
+    one = jax.tree.map(
+        lambda x: x[0], replace(g, event_time_s=times, vehicle=replace(g.vehicle, body=body), counter=None)
+    )
+    group = made.groups[0]
+    params, limits = jax.tree.map(lambda x: x[0], (group.params, group.limits))
+    after = record_events(made, group.kind, jnp.float32(2.0), params, limits, one, jnp.array(False))
+    assert bool(after.active) is slides
 
 
 def test_failsafes_can_be_switched_off():
