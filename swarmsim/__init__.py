@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any
 # XLA logs an error for every program that it loads from the compilation cache, though nothing is wrong: it compares
 # tuning preferences (prefer-no-gather) with the processor's features. Whoever wants its log sets the variable.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-# XLA's CPU runtime launches every fused loop by itself, and a control period of a few vehicles is hundreds of loops over
-# three or four numbers. This lets it compile whole loops of the program into one function each, as it does by itself up
-# to 1 KiB: a mission then flies in less than half of the time. XLA reads its flags when it is first used, so that this
-# needs swarmsim to be imported before; whoever sets these options keeps theirs.
+# XLA's CPU runtime launches every fused loop by itself, and a control period of a few vehicles is hundreds of loops
+# over three or four numbers. This lets it compile whole loops of the program into one function each, as it does by
+# itself up to 1 KiB: a mission then flies in half of the time. XLA reads its flags when it is first used, so that
+# swarmsim has to be imported before that; whoever sets these options keeps theirs.
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 if "xla_backend_extra_options" not in _FLAGS:
     _WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"

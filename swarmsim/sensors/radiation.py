@@ -1,6 +1,8 @@
 """A radiation counter on a vehicle: rates along its way, added up over its exposure, then drawn as counts."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +112,7 @@ def count(
     tick: jax.Array,
     control_period_s: float,
     due: jax.Array,
+    branch: Callable[..., Any] = jax.lax.cond,
 ) -> CounterState:
     """The counters (axis U) after the rate was evaluated at the end of control period ``tick``, if that is ``due``.
 
@@ -125,6 +128,7 @@ def count(
         key: of the mission; a draw depends on it, the time and the vehicle's number only.
         tick, control_period_s: the time; the first control period has the number 1.
         due: [] bool; without it the state is returned as it is.
+        branch: computes the rate if it is due: `jax.lax.cond` or the like.
     """
     # Across the branches go the key's bits: JAX (0.10.1) cannot take the gradient of a scan whose `cond` keeps a key.
     bits, impl = jax.random.key_data(key), jax.random.key_impl(key)
@@ -146,7 +150,7 @@ def count(
         return rate, counts
 
     # Little goes across the branches: an accelerator copies each array.
-    rate, counts = jax.lax.cond(due, evaluate, lambda: (none, none))
+    rate, counts = branch(due, evaluate, lambda: (none, none))
     summed = replace(
         state,
         rate_cps=state.rate_cps + rate,

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.pytree import pytree
-from swarmsim.world.neighbours import Candidates, norm, root
+from swarmsim.world.neighbours import Candidates, dot, norm, root
 
 RESTITUTION = 0.2
 """Speed of parting over that of approach: an estimate for light frames, propellers and bumpers that give way."""
@@ -78,7 +78,7 @@ def collide(bodies: Bodies, near: Candidates, dt: float) -> Collisions:
     # Of the points that touch: what spins already is not turned on and on by what it lies on.
     closing = closing + jnp.cross(bodies.rate_rad_s[:, None], arm) - jnp.cross(of(bodies.rate_rad_s), others)
     impulse = _impulses(bodies, near, meets, closing, normal, (arm, others), jnp.maximum(depth - TOUCH_M, 0.0))
-    touched = meets & (jnp.sum(impulse * impulse, axis=-1) > 0.0)
+    touched = meets & (dot(impulse, impulse) > 0.0)
     number = jnp.sum(touched, axis=1).astype(jnp.float32)
     impulse = impulse / jnp.maximum(jnp.maximum(number[:, None], of(number)), 1.0)[..., None]
     moves = jnp.isfinite(bodies.mass_kg)[:, None]
@@ -91,9 +91,9 @@ def collide(bodies: Bodies, near: Candidates, dt: float) -> Collisions:
 
 def _rims_overlap(apart: jax.Array, closing: jax.Array, reach: jax.Array) -> tuple[jax.Array, jax.Array]:
     """From when to when [V, C] s the horizontal distance is below ``reach`` [V, C], at constant velocities."""
-    a = jnp.sum(closing[..., :2] ** 2, axis=-1)
-    b = jnp.sum(apart[..., :2] * closing[..., :2], axis=-1)
-    c = jnp.sum(apart[..., :2] ** 2, axis=-1) - reach * reach
+    a = dot(closing[..., :2], closing[..., :2])
+    b = dot(apart[..., :2], closing[..., :2])
+    c = dot(apart[..., :2], apart[..., :2]) - reach * reach
     discriminant = b * b - a * c
     spread = root(discriminant)
     still = a < 1e-8
@@ -147,12 +147,10 @@ def _impulses(
         gives = inverse[:, None] + turning[:, None] * mine + (of(inverse) + of(turning) * others)
         return 1.0 / jnp.maximum(gives, 1e-9)
 
-    long = [jnp.sum(arm * arm, axis=-1) for arm in arms]
-    lever = [
-        jnp.maximum(whole - jnp.sum(arm * normal, axis=-1) ** 2, 0.0) for whole, arm in zip(long, arms, strict=True)
-    ]
+    long = [dot(arm, arm) for arm in arms]
+    lever = [jnp.maximum(whole - dot(arm, normal) ** 2, 0.0) for whole, arm in zip(long, arms, strict=True)]
     effective = effective_mass(*lever)
-    along = jnp.sum(closing * normal, axis=-1)
+    along = dot(closing, normal)
     wanted = jnp.minimum(PART_1_S * depth, PART_MAX_M_S)
     parting = wanted - jnp.where(along < 0.0, 1.0 + RESTITUTION, 1.0) * along
     push = jnp.where(meets, effective * jnp.maximum(parting, 0.0), 0.0)

@@ -1,7 +1,9 @@
 """Detectors of vehicles that go several control periods at once: where their rates were due, and the counts there."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +34,7 @@ def noted(
 
 def counted(
     world: World, group: Group, key: jax.Array, first: jax.Array, ticks: int, running: jax.Array,
-    before: GroupState, after: GroupState, seen: tuple[RigidState, ...],
+    before: GroupState, after: GroupState, seen: tuple[RigidState, ...], branch: Callable[..., Any] = jax.lax.cond,
 ) -> GroupState:  # fmt: skip
     """The group (axis U) ``ticks`` control periods after the one numbered ``first``, with its detectors.
 
@@ -44,6 +46,7 @@ def counted(
         running: [] bool, whether the group was stepped.
         before, after: the group then and now; the counter is taken from ``before``.
         seen: from `noted`.
+        branch: how to compute what is not always due.
     """
     counter, counter_state = group.counter, before.counter
     if counter is None or counter_state is None:
@@ -55,6 +58,6 @@ def counted(
         due = running & (tick <= first + ticks)
         counter_state = count(
             counter, counter_state, body, measuring, group.member, world.site, world.sources, key, tick,
-            world.timing.control_period_s, due,
+            world.timing.control_period_s, due, branch,
         )  # fmt: skip
     return replace(after, counter=counter_state)

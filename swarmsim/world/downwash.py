@@ -6,7 +6,7 @@ import numpy as np
 
 from swarmsim.pytree import pytree
 from swarmsim.vehicles.rotors import AIR_DENSITY_KG_M3
-from swarmsim.world.neighbours import Candidates
+from swarmsim.world.neighbours import Candidates, dot
 
 SPREAD = 0.096
 """Half width of a round turbulent jet over the distance from its virtual origin (Pope, Turbulent Flows, 2000, section
@@ -59,9 +59,9 @@ def downwash(craft: Rotorcraft, near: Candidates) -> jax.Array:
     age = 0.5 * (length * length - origin * origin) / jnp.where(blows, flow, 1.0)
     aside = jnp.where(blows[..., None], below[..., :2] + age[..., None] * of(drift), 0.0)
     own = 0.25 * craft.span_m * craft.span_m  # its rotors are this far from its middle, squared
-    square = (jnp.sum(aside * aside, axis=-1) + own[:, None]) / (SPREAD * SPREAD * length * length)
+    square = (dot(aside, aside) + own[:, None]) / (SPREAD * SPREAD * length * length)
     speed = jnp.where(blows, flow, 0.0) / (length * (1.0 + _SHAPE * square) ** 2)
-    away = jnp.sum(below[..., :2] ** 2, axis=-1) / (REACH_MAX * REACH_MAX)
+    away = dot(below[..., :2], below[..., :2]) / (REACH_MAX * REACH_MAX)
     near_enough = _faded(depth / DEPTH_MAX, span) * _faded(jnp.sqrt(away + 1e-12), span)
     near_enough *= jnp.clip(4.0 * depth / jnp.maximum(span, 1e-3), 0.0, 1.0)  # nothing at the same height
     total = jnp.sum((near_enough * speed) ** 2, axis=1)

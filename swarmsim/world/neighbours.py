@@ -107,9 +107,14 @@ def cleared(position_m: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.where(usable[:, None], position_m, 0.0), usable
 
 
+def dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Sum of products over the last axis, which is short: written out, because a reduction is a kernel of its own."""
+    return sum((a[..., axis] * b[..., axis] for axis in range(1, a.shape[-1])), a[..., 0] * b[..., 0])
+
+
 def norm(vector: jax.Array) -> jax.Array:
     """Euclidean norm over the last axis, with gradient 0 at 0."""
-    return root(jnp.sum(vector * vector, axis=-1))
+    return root(dot(vector, vector))
 
 
 def root(square: jax.Array) -> jax.Array:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.pytree import pytree
-from swarmsim.world.neighbours import DENSE_MAX, WINDOW, Candidates, candidates, cleared, norm, root
+from swarmsim.world.neighbours import DENSE_MAX, WINDOW, Candidates, candidates, cleared, dot, norm, root
 
 LOOK_AHEAD_S = 2.0  # to brake from 5 m/s and step aside by 3 m with an acceleration of 4 m/s²
 SLOW_M_S = 0.1  # a slower multirotor near the ground counts as standing there
@@ -176,7 +176,7 @@ def kept_aside(
     """
     push = push_m * jnp.exp(-dt / BACK_S) + (dt / ASIDE_S) * wanted_m
     push = _limited(push, jnp.where(jnp.isfinite(height_m), height_m, 0.0), flies, separation_m)
-    return push, jnp.sum(push * push, axis=-1) > (HOLD_SHARE * separation_m) ** 2
+    return push, dot(push, push) > (HOLD_SHARE * separation_m) ** 2
 
 
 def _contacts(fleet: _Fleet, near: Candidates) -> tuple[jax.Array, jax.Array]:
@@ -185,9 +185,9 @@ def _contacts(fleet: _Fleet, near: Candidates) -> tuple[jax.Array, jax.Array]:
     apart = fleet.position_m[:, None] - of(fleet.position_m)
     outline = jnp.stack([fleet.radius_m, fleet.half_height_m, fleet.active.astype(jnp.float32)], axis=-1)
     both = outline[:, None] + of(outline)
-    wide = jnp.sum(apart[..., :2] ** 2, axis=-1) < both[..., 0] ** 2
+    wide = dot(apart[..., :2], apart[..., :2]) < both[..., 0] ** 2
     collided = pair & wide & (jnp.abs(apart[..., 2]) < both[..., 1]) & (both[..., 2] > 0.0)
-    square = jnp.min(jnp.where(pair, jnp.sum(apart * apart, axis=-1), jnp.inf), axis=1, initial=jnp.inf)
+    square = jnp.min(jnp.where(pair, dot(apart, apart), jnp.inf), axis=1, initial=jnp.inf)
     within = square <= jnp.max(fleet.gap_m, initial=0.0) ** 2
     return jnp.any(collided, axis=1), jnp.where(within, root(jnp.where(within, square, 0.0)), jnp.inf)
 
@@ -209,13 +209,13 @@ def _yields(fleet: _Fleet, near: Candidates, close: bool, coming: bool) -> tuple
     precedes &= other[..., 4] < mine[..., 4]
     gap = fleet.gap_m[:, None] ** 2
     apart = mine[..., :3] - other[..., :3]
-    square = jnp.sum(apart * apart, axis=-1)
+    square = dot(apart, apart)
     found = (square < gap) if close else jnp.zeros_like(precedes)
     if coming:
         both = _closest(apart, other[..., 5:] - mine[..., 5:])  # the other flies on ...
         alone = _closest(apart, -mine[..., 5:])  # ... or stops, as at a corner of its path
         room = gap * fleet.margin[:, None] ** 2
-        meets = (jnp.sum(both * both, axis=-1) < room) | (jnp.sum(alone * alone, axis=-1) < room)
+        meets = (dot(both, both) < room) | (dot(alone, alone) < room)
         found |= near.of(fleet.roams) & (square >= gap) & meets
     score = jnp.where(precedes & found, -square, -jnp.inf)
     if score.shape[1] <= ENCOUNTERS:
@@ -237,7 +237,7 @@ def _push(fleet: _Fleet, index: jax.Array, valid: jax.Array) -> jax.Array:
 
 def _closest(apart: jax.Array, velocity: jax.Array) -> jax.Array:
     """Offset [..., 3] from the other one when it is closest within the look-ahead, moving at a relative velocity."""
-    time = jnp.sum(apart * velocity, axis=-1) / jnp.maximum(jnp.sum(velocity**2, axis=-1), 1e-6)
+    time = dot(apart, velocity) / jnp.maximum(dot(velocity, velocity), 1e-6)
     return apart - jnp.clip(time, 0.0, LOOK_AHEAD_S)[..., None] * velocity
 
 

@@ -98,10 +98,10 @@ def step(world: World, state: WorldState, commands: Sequence[Any], periods: int 
             f"periods is {periods}: commands can be held for 1 to {judging} control periods, which are a judging period"
         )
     first = state.clock.tick
-    due = -first % judging < periods
-    look = partial(look_around, world, number=(first + periods - 1) // judging)
-    untouched = [jnp.zeros(group.size, bool) for group in world.groups]
-    state, collided = jax.lax.cond(due, look, lambda s: (s, untouched), state)
+    due = jnp.array(True) if periods == judging else -first % judging < periods
+    look = partial(look_around, world, state, (first + periods - 1) // judging)
+    untouched = state, [jnp.zeros(group.size, bool) for group in world.groups]
+    state, collided = look() if periods == judging else either(due, look, lambda: untouched)
     go = partial(_go, world, state, due, periods)
     full = full_commands(world, commands)
     groups = tuple(go(number, command, hit) for number, (command, hit) in enumerate(zip(full, collided, strict=True)))
@@ -207,7 +207,18 @@ def _go(
         go = partial(_all_periods, group, periods, running, due, *each)
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
     after, places = go(group.params, group.limits, seen, collided, command)
-    return counted(world, group, state.key, first, periods, running, before, after, places)
+    return counted(world, group, state.key, first, periods, running, before, after, places, branch=either)
+
+
+def either(predicate: jax.Array, one: Callable[[], Any], other: Callable[[], Any]) -> Any:
+    """The result of ``one`` where ``predicate`` [] holds, else that of ``other``.
+
+    A condition that each mission has of its own makes `jax.vmap` compute both anyway, and `jax.lax.cond` copy all that
+    they read, rasters of the site as well, for every mission. On a GPU, which steps many, both are computed at once.
+    """
+    if not _in_kernels():
+        return jax.lax.cond(predicate, one, other)
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(predicate, a, b), one(), other())
 
 
 def _in_kernels() -> bool:
