@@ -44,7 +44,7 @@ class WindFailsafe(Failsafe):
     """For ``after_s`` the air carries the vehicle off, faster than ``drift_m_s``, although it does nearly all it can.
 
     Nearly all is a ``share`` of the largest tilt (as tangents) or rotor speed. A vehicle that only lags behind in a
-    gust flies on; at the fence it lands at once.
+    gust flies on; where the wind would have it over the fence before it is down it lands at once.
     """
 
     action: Action = "land"

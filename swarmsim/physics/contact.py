@@ -12,6 +12,9 @@ from swarmsim.pytree import pytree
 SLIP_M_S = 0.1
 """Slip along a wall at which its friction is 71 % of that of Coulomb."""
 
+PART_M_S = 1.0
+"""Largest speed at which a spring makes a body part from what it touches: frames and feet do not throw it back."""
+
 
 @pytree
 class Plane:
@@ -31,6 +34,7 @@ class ContactPoints:
     tangential_n_m: jax.Array  # [] N/m, tangential, while the point sticks
     damping_n_s_m: jax.Array  # [] N s/m, normal
     friction: jax.Array  # [] Coulomb coefficient
+    mass_kg: jax.Array  # [] of the body
 
 
 def contact_wrench(
@@ -58,7 +62,8 @@ def contact_wrench(
     velocity = velocity_m_s + _cross(w, points.position_m)
     closing = jnp.sum(velocity * normal, axis=-1)
     touching = height_m < 0.0
-    push = jnp.where(touching, jnp.maximum(-points.stiffness_n_m * height_m - points.damping_n_s_m * closing, 0.0), 0.0)
+    most = points.mass_kg / jnp.maximum(jnp.sum(touching), 1) / dt
+    push = jnp.where(touching, _push(points, -height_m, closing, most), 0.0)
     along = velocity - closing[:, None] * normal
     give = slip_m - jnp.sum(slip_m * normal, axis=-1, keepdims=True) * normal + dt * along
     ratio = points.tangential_n_m / points.stiffness_n_m
@@ -78,6 +83,7 @@ def wall_wrench(
     normal: jax.Array,
     velocity_m_s: jax.Array,
     angular_velocity_rad_s: jax.Array,
+    dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Force [3] N and torque [3] N m about the body's origin (body frame) of an upright wall on the body's rim.
 
@@ -89,12 +95,22 @@ def wall_wrench(
     velocity = velocity_m_s + _cross(angular_velocity_rad_s, arm)
     closing = jnp.sum(velocity * normal)
     depth = radius_m - distance_m
-    push = jnp.maximum(points.stiffness_n_m * depth - points.damping_n_s_m * closing, 0.0)
-    push = jnp.where(depth > 0.0, push, 0.0)
+    push = jnp.where(depth > 0.0, _push(points, depth, closing, points.mass_kg / dt), 0.0)
     along = velocity - closing * normal
     slip = jax.lax.rsqrt(jnp.sum(along * along) + SLIP_M_S * SLIP_M_S)
     force = push * (normal - points.friction * slip * along)
     return force, _cross(arm, force)
+
+
+def _push(points: ContactPoints, depth_m: jax.Array, parting_m_s: jax.Array, stops_n_s_m: jax.Array) -> jax.Array:
+    """Normal force [...] N of a point ``depth_m`` [...] deep that moves out by ``parting_m_s`` [...].
+
+    Within a step, in which ``stops_n_s_m`` [] N take a speed of 1 m/s off, nothing is made to part faster than
+    `PART_M_S`: at the edge of a roof a vehicle can be deep in what has just become its wall or its ground, and would be
+    thrown.
+    """
+    most = stops_n_s_m * jnp.maximum(PART_M_S - parting_m_s, 0.0)
+    return jnp.clip(points.stiffness_n_m * depth_m - points.damping_n_s_m * parting_m_s, 0.0, most)
 
 
 def _cross(a: jax.Array, b: jax.Array) -> jax.Array:

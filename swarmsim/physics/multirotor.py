@@ -147,6 +147,7 @@ def step_loads(
             normal=away,
             velocity_m_s=velocity,
             angular_velocity_rad_s=rate,
+            dt=dt,
         )
         contact_force, contact_torque = contact_force + push, contact_torque + turn
         touches |= jnp.sum(push * away) > 0.0
@@ -190,6 +191,7 @@ def contact_points(params: MultirotorParams) -> ContactPoints:
         tangential_n_m=params.contact_tangential_n_m,
         damping_n_s_m=params.contact_damping_n_s_m,
         friction=params.contact_friction,
+        mass_kg=params.mass_kg,
     )
 
 

@@ -14,9 +14,9 @@ RESTITUTION = 0.2
 """Speed of parting over that of approach: an estimate for light frames, propellers and bumpers that give way."""
 FRICTION = 0.3
 """Coulomb coefficient between vehicles: an estimate for plastic, carbon fibre and aluminium."""
-PART_1_S = 4.0
-"""Rate at which vehicles that overlap are moved apart; at most by `PART_MAX_M_S`."""
-PART_MAX_M_S = 1.0
+PART_M_S = 0.8
+"""Speed at which vehicles that overlap are moved apart; a slower one would only strain the feet of two that lie on the
+ground."""
 TOUCH_M = 0.02
 """Cylinders closer than this touch."""
 
@@ -151,7 +151,7 @@ def _impulses(
     lever = [jnp.maximum(whole - dot(arm, normal) ** 2, 0.0) for whole, arm in zip(long, arms, strict=True)]
     effective = effective_mass(*lever)
     along = dot(closing, normal)
-    wanted = jnp.minimum(PART_1_S * depth, PART_MAX_M_S)
+    wanted = jnp.where(depth > 0.0, PART_M_S, 0.0)
     parting = wanted - jnp.where(along < 0.0, 1.0 + RESTITUTION, 1.0) * along
     push = jnp.where(meets, effective * jnp.maximum(parting, 0.0), 0.0)
     across = closing - along[..., None] * normal

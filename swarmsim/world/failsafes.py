@@ -29,6 +29,8 @@ DESCENT_M_S, SLOW_DESCENT_M_S = 1.5, 0.6
 """Rates of descent: PX4's defaults MPC_Z_V_AUTO_DN and, near the ground, MPC_LAND_SPEED."""
 WIND_DESCENT_M_S = 3.0
 """Rate of descent, as far as the vehicle may, out of a wind that carries it off: it is weaker near the ground."""
+CARRIED_S = 2.0
+"""For how long the wind must have carried a vehicle off before it lands early, because the fence is near."""
 
 
 @pytree
@@ -89,7 +91,10 @@ def failing(
     away = level - home_m
     far = jnp.sum(away * away) > rules.link_range_m * rules.link_range_m
     unheard = jnp.where(far, rescue.unheard_s + dt, 0.0)
-    blown = (carried > rules.wind_s) | (outside & (carried > 0.0))  # at the fence there is no time to wait
+    # There is no time to wait where the fence is nearer than the calmer air at the ground.
+    below = level + velocity_m_s[:2] * (above_m / WIND_DESCENT_M_S)
+    soon = jnp.any((below < rules.fence_low_m) | (below > rules.fence_high_m)) & (carried > CARRIED_S)
+    blown = (carried > rules.wind_s) | soon | (outside & (carried > 0.0))
     found = jnp.stack([outside, blown, charge < rules.battery_low, far & (unheard > rules.link_s)])
     return found, Rescue(
         takes_over=rescue.takes_over,

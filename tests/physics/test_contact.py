@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmsim.physics.contact import ContactPoints, contact_wrench
+from swarmsim.physics.contact import PART_M_S, ContactPoints, contact_wrench
 
 DT = 0.005
 UP = jnp.array([0.0, 0.0, 1.0])
@@ -16,6 +16,7 @@ FEET = ContactPoints(
     tangential_n_m=jnp.float32(3000.0),
     damping_n_s_m=jnp.float32(70.0),
     friction=jnp.float32(0.7),
+    mass_kg=jnp.float32(3.5),
 )
 
 
@@ -71,3 +72,10 @@ def test_spinning_on_the_feet_is_braked_about_the_normal():
     np.testing.assert_allclose(force[:2], 0.0, atol=1e-4)
     assert float(torque[2]) < 0.0
     np.testing.assert_allclose(torque[:2], 0.0, atol=1e-4)
+
+
+@given(st.floats(0.0, 2.0), st.floats(-20.0, 20.0))
+def test_no_depth_throws_the_body_back(depth, speed):
+    """One step after it has come to be ``depth`` m deep at ``speed`` m/s, up is positive."""
+    force, _, _ = contact(-depth, (0.0, 0.0, speed))
+    assert speed + DT * float(force[2]) / 3.5 <= max(speed, PART_M_S) + 1e-3

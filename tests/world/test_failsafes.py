@@ -10,6 +10,7 @@ import pytest
 from swarmsim.config.errors import InputError
 from swarmsim.control.commands import fly_velocity, go_to
 from swarmsim.world import events
+from swarmsim.world.failsafes import failing, no_rescue
 from swarmsim.world.judge import record_events
 from tests.world.worlds import airborne, begin, fly, happened, row, with_group, world
 
@@ -151,3 +152,19 @@ def test_failsafes_can_be_switched_off():
     state, tracks = fly(made, airborne(made, start, places), (go(places, [6.0, 0, 0]),), 4.0)
     assert happened(state) == [set()] * COUNT
     assert tracks[0].position_m[-1, 0, 0] > 45.0
+
+
+@pytest.mark.parametrize(("carried_s", "speed", "lands"), [(3.0, 3.0, True), (3.0, 1.2, False), (1.0, 3.0, False)])
+def test_what_the_wind_carries_to_the_fence_lands_in_time(carried_s, speed, lands):
+    """20 m up and 15 m from the fence: at 3 m/s it would cross before it is down, at 1.2 m/s it would not."""
+    rules = world(row("uav", "x500", 1, (0.0, 0.0))).failsafes
+    east = float(rules.fence_high_m[0])
+    found, after = failing(
+        rules, replace(no_rescue(), carried_s=jnp.float32(carried_s)),
+        position_m=jnp.array([east - 15.0, 0.0, 20.0]), velocity_m_s=jnp.array([speed, 0.0, 0.0]),
+        brake_m_s2=jnp.float32(4.0), above_m=jnp.float32(20.0), carried_m_s=jnp.float32(speed),
+        charge=jnp.float32(1.0), home_m=jnp.zeros(2), dt=0.05,
+    )  # fmt: skip
+    assert bool(found[events.FAILSAFES.index("wind")]) == lands
+    assert not bool(found[events.FAILSAFES.index("fence")])
+    assert float(after.carried_s) == pytest.approx(carried_s + 0.05)

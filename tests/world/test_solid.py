@@ -101,3 +101,17 @@ def test_walls_stop_whatever_flies_into_them(place):
     down = np.array(["obstacle" in k for k in kinds]) & (np.abs(tracks[0].velocity_m_s[-1]).max(-1) < 0.05)
     assert down.sum() > 0.7 * COUNT
     assert (end[down, 2] < 0.5).all()  # on the ground in front of the wall
+
+
+def test_nothing_is_thrown_at_the_edge_of_a_roof(place):
+    """What falls or drifts onto the edge gains no speed but that of its fall, wherever it touches."""
+    made, start = place
+    draw = np.random.default_rng(7)
+    edge = draw.uniform(SOUTH + 1.0, NORTH - 1.0, COUNT)
+    at = np.stack([EAST + draw.uniform(-0.6, 0.6, COUNT), edge, ROOF_M + draw.uniform(-0.6, 1.0, COUNT)], -1)
+    velocity = np.stack([draw.uniform(-2.0, 2.0, COUNT), draw.uniform(-1.0, 1.0, COUNT), np.full(COUNT, -1.0)], -1)
+    _, tracks = fly(made, airborne(made, start, at, velocity), (off(),), 2.0)
+    speed = np.linalg.norm(tracks[0].velocity_m_s, axis=-1)
+    fallen = at[:, 2] - tracks[0].position_m[..., 2]
+    most = np.sqrt(np.sum(velocity**2, axis=-1) + 2.0 * 9.81 * np.maximum(fallen, 0.0))
+    assert (speed - most).max() < 0.8
