@@ -1,4 +1,4 @@
-"""Who gives way in one mission: waiting, stepping aside, collisions."""
+"""Who gives way in one mission: waiting and stepping aside."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,6 @@ class Traffic:
 
     hold: jax.Array  # [V] bool: wait, another has the right of way
     push_m: jax.Array  # [V, 3] m, displacement of the reference away from the others, world; multirotors in flight
-    collided: jax.Array  # [V] bool: its cylinder overlaps another's
     nearest_m: jax.Array  # [V] m, distance in 3-D of the nearest other; inf where none is within the separation
     overflow: jax.Array  # [] bool: a window was too small, so that somebody may have been missed
 
@@ -45,7 +44,6 @@ class _Fleet:
     active: jax.Array  # [V] bool
     roams: jax.Array  # [V] bool: active, and no multirotor that stands on the ground
     radius_m: jax.Array  # [V]
-    half_height_m: jax.Array  # [V]
 
 
 def right_of_way(
@@ -57,7 +55,6 @@ def right_of_way(
     active: jax.Array,
     rank: jax.Array,
     radius_m: jax.Array,
-    half_height_m: jax.Array,
     separation_m: jax.Array,
     ground_separation_m: jax.Array,
     held: jax.Array | None = None,
@@ -65,7 +62,7 @@ def right_of_way(
     window: int = WINDOW,
     dense_max: int = DENSE_MAX,
 ) -> Traffic:
-    """Who waits, who steps aside and who has collided.
+    """Who waits, and who steps aside.
 
     Precedence. Multirotors yield to multirotors, rovers to rovers. Of two multirotors one in flight (more than
     ``PUSH_FROM_M`` above ground) goes before one on the ground; of two alike the lower rank goes first. This is a
@@ -85,8 +82,6 @@ def right_of_way(
     nobody is pushed onto a neighbour's pad. Rovers only hold: one that stands in another's way is not avoided, which
     is left to the planner of their paths.
 
-    Collisions are overlaps of upright cylinders, of any vehicle under way with any other.
-
     Args:
         position_m: [V, 3] m, world ENU, middle of the collision cylinder. Non-finite: taken as absent.
         velocity_m_s: [V, 3] m/s, world.
@@ -94,7 +89,7 @@ def right_of_way(
         flies: [V] bool, multirotors; the others are rovers.
         active: [V] bool, under way: its task has begun and not ended. One that waits for a later phase is not.
         rank: [V] int32, distinct, from 0 to 2²² - 1.
-        radius_m, half_height_m: [V] m, collision cylinders.
+        radius_m: [V] m, of the collision cylinders.
         separation_m: [] m, between multirotors, 3-D.
         ground_separation_m: [] m, between rovers, 3-D.
         held: [V] bool, which were told to wait before: they set out only where the look-ahead leaves `RELEASE` times
@@ -123,7 +118,6 @@ def right_of_way(
         active=moving,
         roams=moving & (flying | ~flies | (pace > SLOW_M_S)),
         radius_m=radius_m,
-        half_height_m=half_height_m,
     )
     reach = reach_of(usable, radius_m, fleet.gap_m)
     if near is None:
@@ -139,12 +133,10 @@ def right_of_way(
         more = _yields(fleet, far, close=False, coming=True)
         index, valid = (jnp.concatenate(x, axis=1) for x in zip((index, valid), more, strict=True))
         overflow = overflow | far.overflow
-    collided, nearest = _contacts(fleet, near)
     return Traffic(
         hold=jnp.any(valid, axis=1),
         push_m=_limited(_push(fleet, index, valid), height, flies, separation_m),
-        collided=collided,
-        nearest_m=nearest,
+        nearest_m=_nearest(fleet, near),
         overflow=overflow,
     )
 
@@ -179,17 +171,12 @@ def kept_aside(
     return push, dot(push, push) > (HOLD_SHARE * separation_m) ** 2
 
 
-def _contacts(fleet: _Fleet, near: Candidates) -> tuple[jax.Array, jax.Array]:
-    """Which vehicles have collided [V], and the distance of the nearest other [V] within the separation."""
-    of, pair = near.of, near.pair
-    apart = fleet.position_m[:, None] - of(fleet.position_m)
-    outline = jnp.stack([fleet.radius_m, fleet.half_height_m, fleet.active.astype(jnp.float32)], axis=-1)
-    both = outline[:, None] + of(outline)
-    wide = dot(apart[..., :2], apart[..., :2]) < both[..., 0] ** 2
-    collided = pair & wide & (jnp.abs(apart[..., 2]) < both[..., 1]) & (both[..., 2] > 0.0)
-    square = jnp.min(jnp.where(pair, dot(apart, apart), jnp.inf), axis=1, initial=jnp.inf)
+def _nearest(fleet: _Fleet, near: Candidates) -> jax.Array:
+    """Distance [V] m of the nearest other one within the separation; inf where there is none."""
+    apart = fleet.position_m[:, None] - near.of(fleet.position_m)
+    square = jnp.min(jnp.where(near.pair, dot(apart, apart), jnp.inf), axis=1, initial=jnp.inf)
     within = square <= jnp.max(fleet.gap_m, initial=0.0) ** 2
-    return jnp.any(collided, axis=1), jnp.where(within, root(jnp.where(within, square, 0.0)), jnp.inf)
+    return jnp.where(within, root(jnp.where(within, square, 0.0)), jnp.inf)
 
 
 def _yields(fleet: _Fleet, near: Candidates, close: bool, coming: bool) -> tuple[jax.Array, jax.Array]:

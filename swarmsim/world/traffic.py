@@ -147,7 +147,6 @@ def _traffic(world: World, groups: Groups, fleet: _Fleet, near: Candidates) -> T
         active=able,
         rank=jnp.concatenate([group.member for group in world.groups]),
         radius_m=fleet.radius_m,
-        half_height_m=fleet.half_height_m,
         separation_m=rules.separation_m,
         ground_separation_m=rules.ground_separation_m,
         held=jnp.concatenate([g.around.hold for g in groups]),

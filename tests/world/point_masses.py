@@ -31,12 +31,19 @@ def traffic(position, velocity=None, **changes):
         "active": jnp.ones(count, bool),
         "rank": jnp.arange(count),
         "radius_m": jnp.full(count, RADIUS_M),
-        "half_height_m": jnp.full(count, HALF_HEIGHT_M),
         "separation_m": jnp.float32(SEPARATION_M),
         "ground_separation_m": jnp.float32(GROUND_SEPARATION_M),
     } | {k: v if isinstance(v, int) else jnp.asarray(v) for k, v in changes.items()}
     velocity = jnp.zeros((count, 3)) if velocity is None else jnp.asarray(velocity, jnp.float32)
     return _right_of_way(position, velocity, **given)
+
+
+def overlapping(p, exists, active):
+    """Which vehicles [V] under way overlap another one, as upright cylinders; ``p`` [V, 3] are their middles."""
+    apart = jnp.abs(p[:, None] - p[None])
+    pair = exists[:, None] & exists & (active[:, None] | active) & ~jnp.eye(len(p), dtype=bool)
+    beside = jnp.linalg.norm(apart[..., :2], axis=-1) < 2.0 * RADIUS_M
+    return jnp.any(pair & beside & (apart[..., 2] < 2.0 * HALF_HEIGHT_M), axis=1)
 
 
 @pytree
@@ -91,7 +98,7 @@ def flown(way, speed):
         flown = Flown(
             time_s=number * DT_S,
             landed=flown.landed | ((progress > end[:, -1] - 0.01) & (p[:, 2] < HALF_HEIGHT_M + 0.1)),
-            collided=flown.collided | rules.collided,
+            collided=flown.collided | overlapping(p, exists, active),
             nearest_m=jnp.minimum(flown.nearest_m, jnp.where(active, rules.nearest_m, jnp.inf)),
         )
         return number + 1, p, v, progress, go, push, hold, flown

@@ -86,7 +86,7 @@ def test_outliers_and_diverged_vehicles_leave_the_others_alone(dense_max):
     assert not bool(found.overflow)
     rules = traffic(strange, dense_max=dense_max)
     np.testing.assert_array_equal(rules.hold[rest], traffic(position[rest]).hold)
-    for leaf in (rules.push_m, rules.hold[np.array(odd)], rules.collided[np.array(odd)]):
+    for leaf in (rules.push_m, rules.hold[np.array(odd)]):
         assert not np.any(np.isnan(leaf))
     assert not np.any(rules.hold[np.array(odd)])
 

@@ -8,8 +8,6 @@ from hypothesis import strategies as st
 from swarmsim.world.right_of_way import ASIDE_S, BACK_S, PUSH_FROM_M, Traffic, kept_aside
 from tests.world.point_masses import (
     ALL_PAIRS,
-    HALF_HEIGHT_M,
-    RADIUS_M,
     SEPARATION_M,
     cloud,
     flown,
@@ -35,7 +33,7 @@ def test_both_searches_give_the_same_rules(seed, size):
     given["height_m"] = np.where(given["flies"], rng.uniform(0.0, 20.0, 400), 0.0).astype(np.float32)
     cells, pairs = (traffic(position, velocity, dense_max=d, window=128, **given) for d in (0, ALL_PAIRS))
     assert not bool(cells.overflow)
-    for name in ("hold", "collided", "nearest_m"):
+    for name in ("hold", "nearest_m"):
         np.testing.assert_allclose(getattr(cells, name), getattr(pairs, name), rtol=1e-6)
     # With more encounters than are counted, the two searches count different ones.
     few = np.linalg.norm(np.asarray(pairs.push_m) - np.asarray(cells.push_m), axis=1) < 1e-3
@@ -150,28 +148,6 @@ def test_the_push_fades_towards_the_ground_and_never_leads_into_it(height, share
     np.testing.assert_allclose(result.push_m[1, :2], share * full.push_m[1, :2], atol=1e-5)
     above = traffic([[0.0, 0.0, height + 3.0], [0.0, 0.0, height]], height_m=[height + 3.0, height])
     assert float(above.push_m[1, 2]) >= -max(height - 3.0, 0.0) - 1e-6
-
-
-def collisions(position, **changes):
-    return list(np.asarray(traffic(position, **changes).collided))
-
-
-def test_collisions_are_overlaps_of_upright_cylinders():
-    level, over = 2.0 * RADIUS_M, 2.0 * HALF_HEIGHT_M
-    assert collisions([[0.0, 0.0, 9.0], [0.99 * level, 0.0, 9.0]]) == [True, True]
-    assert collisions([[0.0, 0.0, 9.0], [1.01 * level, 0.0, 9.0]]) == [False, False]
-    assert collisions([[0.0, 0.0, 9.0], [0.0, 0.0, 9.0 + 0.99 * over]]) == [True, True]
-    assert collisions([[0.0, 0.0, 9.0], [0.0, 0.0, 9.0 + 1.01 * over]]) == [False, False]
-
-
-def test_one_under_way_collides_with_any_that_is_there_and_those_at_rest_with_none():
-    pair = [[0.0, 0.0, 0.2], [1.0, 0.0, 0.2]]
-    assert collisions(pair, active=[True, False]) == [True, True]
-    assert collisions(pair, active=[False, False]) == [False, False]
-    assert collisions(pair, flies=[True, False]) == [True, True]
-    beside = [[0.0, 0.0, 0.2], [1.1, 0.0, 0.4]]
-    assert collisions(beside, flies=[True, False], radius_m=[0.5, 0.55]) == [False, False]
-    assert collisions(beside, flies=[True, False], radius_m=[0.5, 0.65]) == [True, True]
 
 
 def test_the_distance_of_the_nearest_is_given_within_the_separation():
