@@ -25,11 +25,12 @@ from typing import TYPE_CHECKING, Any
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # XLA's CPU runtime launches every fused loop by itself, and a control period of a few vehicles is hundreds of loops
 # over three or four numbers. This lets it compile whole loops of the program into one function each, as it does by
-# itself up to 1 KiB: a mission then flies in half of the time. XLA reads its flags when it is first used, so that
-# swarmsim has to be imported before that; whoever sets these options keeps theirs.
+# itself for those that touch less than 1 KiB: a mission then flies in half of the time. (Without any limit, a fleet of
+# thousands takes a minute to compile.) XLA reads its flags when it is first used, so that swarmsim has to be imported
+# before that; whoever sets these options keeps theirs.
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 if "xla_backend_extra_options" not in _FLAGS:
-    _WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000"
+    _WHOLE_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=100000000"
     os.environ["XLA_FLAGS"] = f"{_FLAGS} {_WHOLE_LOOPS}".strip()
 
 if TYPE_CHECKING:
