@@ -43,7 +43,6 @@ class _Fleet:
     flies: jax.Array  # [V] bool
     active: jax.Array  # [V] bool
     roams: jax.Array  # [V] bool: active, and no multirotor that stands on the ground
-    radius_m: jax.Array  # [V]
 
 
 def right_of_way(
@@ -117,7 +116,6 @@ def right_of_way(
         flies=flies,
         active=moving,
         roams=moving & (flying | ~flies | (pace > SLOW_M_S)),
-        radius_m=radius_m,
     )
     reach = reach_of(usable, radius_m, fleet.gap_m)
     if near is None:

@@ -98,10 +98,14 @@ def step(world: World, state: WorldState, commands: Sequence[Any], periods: int 
             f"periods is {periods}: commands can be held for 1 to {judging} control periods, which are a judging period"
         )
     first = state.clock.tick
-    due = jnp.array(True) if periods == judging else -first % judging < periods
     look = partial(look_around, world, state, (first + periods - 1) // judging)
-    untouched = state, [jnp.zeros(group.size, bool) for group in world.groups]
-    state, collided = look() if periods == judging else either(due, look, lambda: untouched)
+    if periods == judging:
+        due = jnp.array(True)
+        state, collided = look()
+    else:
+        due = -first % judging < periods
+        untouched = state, [jnp.zeros(group.size, bool) for group in world.groups]
+        state, collided = either(due, look, lambda: untouched)
     go = partial(_go, world, state, due, periods)
     full = full_commands(world, commands)
     groups = tuple(go(number, command, hit) for number, (command, hit) in enumerate(zip(full, collided, strict=True)))

@@ -1,5 +1,6 @@
 """Roofs carry, walls stop: what multirotors do to a house, and it to them."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 from swarmsim.control.commands import RotorSpeedCommand, fly_velocity
-from tests.world.worlds import BUILDING, airborne, begin, fly, happened, row, world
+from swarmsim.world.collisions import TOUCH_M
+from tests.world.worlds import BUILDING, airborne, begin, fly, happened, row, with_group, world
 
 WEST, SOUTH, EAST, NORTH = BUILDING
 ROOF_M = 6.0
@@ -115,3 +117,24 @@ def test_nothing_is_thrown_at_the_edge_of_a_roof(place):
     fallen = at[:, 2] - tracks[0].position_m[..., 2]
     most = np.sqrt(np.sum(velocity**2, axis=-1) + 2.0 * 9.81 * np.maximum(fallen, 0.0))
     assert (speed - most).max() < 0.8
+
+
+def test_two_that_lie_in_each_other_come_apart_and_rest(place):
+    """Pairs on their backs, 0.55 to 0.75 m apart, motors off: overlapping cylinders of 0.386 m."""
+    made, start = place
+    draw = np.random.default_rng(3)
+    pairs, x = COUNT // 2, -34.0 + 4.0 * np.arange(COUNT // 2) % 48.0
+    first = np.stack([x, -26.0 + 5.0 * (np.arange(pairs) // 12), np.full(pairs, 0.07)], -1)
+    angle, apart = draw.uniform(0, 2 * np.pi, pairs), draw.uniform(0.55, 0.75, pairs)
+    second = first + np.stack([apart * np.cos(angle), apart * np.sin(angle), np.zeros(pairs)], -1)
+    lying = airborne(made, start, np.concatenate([first, second]))
+    vehicle = lying.groups[0].vehicle
+    on_its_back = jnp.tile(jnp.array([0.0, 1.0, 0.0, 0.0]), (COUNT, 1))
+    body = replace(vehicle.body, quaternion=on_its_back)
+    lying = with_group(lying, 0, vehicle=replace(vehicle, body=body, rotor_speed_rad_s=jnp.zeros((COUNT, 4))))
+    _, tracks = fly(made, lying, (off(),), 4.0)
+    end = tracks[0].position_m[-1]
+    gap = np.linalg.norm((end[:pairs] - end[pairs:])[:, :2], axis=-1)
+    assert gap.min() > 2 * RADIUS_M - TOUCH_M - 1e-3
+    assert gap.max() < 2 * RADIUS_M + 0.1  # parted, not thrown
+    assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.02
