@@ -71,7 +71,8 @@ class Failsafes(Model):
     """What autopilots do by themselves, as PX4 and ArduPilot do; the action ``none`` switches one off.
 
     A vehicle that returns climbs to ``return_clearance_m`` above everything on the site, flies to where it started, and
-    lands there.
+    lands there. One that lands elsewhere flies to the nearest place within the fence that is flat and where nothing
+    stands within its radius and ``landing_clearance_m``, above what stands around it on the way.
     """
 
     fence: Fence = Fence()
@@ -79,3 +80,4 @@ class Failsafes(Model):
     battery: BatteryFailsafe = BatteryFailsafe()
     link: LinkFailsafe = LinkFailsafe()
     return_clearance_m: NonNegative = 5.0
+    landing_clearance_m: NonNegative = 2.0

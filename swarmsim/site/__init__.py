@@ -1,6 +1,6 @@
 """Ground truth of a site: terrain, obstacles, materials, and path lengths of rays through them."""
 
-from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh, sample, sample_with_gradient
+from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh, nearest, sample, sample_with_gradient
 from swarmsim.site.rays import path_lengths
 from swarmsim.site.store import ImportOptions, import_site, load_site
 
@@ -13,6 +13,7 @@ __all__ = [
     "VisualMesh",
     "import_site",
     "load_site",
+    "nearest",
     "path_lengths",
     "sample",
     "sample_with_gradient",

@@ -98,6 +98,15 @@ def sample(raster: jax.Array, site: Site, xy: jax.Array) -> jax.Array:
     return south + y * (north - south)
 
 
+def nearest(raster: jax.Array, site: Site, xy: jax.Array) -> jax.Array:
+    """Value of a site's raster in the cell nearest to ``xy`` [..., 2] (ENU, m), clamped at the border; [...]."""
+    ny, nx = raster.shape
+    place = jnp.clip((xy - site.origin_m) / site.cell_m + 0.5, 0.0, jnp.array([nx - 1, ny - 1], jnp.float32))
+    index = jnp.clip(place.astype(jnp.int32), 0, jnp.array([nx - 1, ny - 1]))  # the conversion of a NaN is undefined
+    flat = jnp.ravel(raster)
+    return flat.at[index[..., 1] * nx + index[..., 0]].get(mode="promise_in_bounds")
+
+
 def sample_with_gradient(raster: jax.Array, site: Site, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Bilinear value [...] at ``xy`` [..., 2] (ENU, m) and its gradient [..., 2] along x and y, per metre.
 

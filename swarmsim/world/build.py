@@ -20,11 +20,12 @@ from swarmsim.radiation.detector import Detector, Source, build_detector
 from swarmsim.radiation.library import Library
 from swarmsim.sensors.radiation import Counter
 from swarmsim.site import Site, SiteModel
+from swarmsim.site.landing_places import landing_places
 from swarmsim.site.model import height_at
 from swarmsim.site.walls import walls_of
 from swarmsim.vehicles.multirotor import multirotor_params
 from swarmsim.vehicles.skid_steer import skid_steer_params
-from swarmsim.world.failsafes import ACTIONS, HOLD, FailsafeRules
+from swarmsim.world.failsafes import ACTIONS, HOLD, LEASH_M, FailsafeRules
 from swarmsim.world.model import Air, Group, Limits, Radio, Timing, TrafficRules, World
 
 NOWHERE_M = 1e6
@@ -113,6 +114,8 @@ def _failsafes(scenario: Scenario, site: Site) -> FailsafeRules:
             given=f"a margin of {margin:g} m",
             suggestion="make the margin smaller, or set failsafes.fence.action to none",
         )
+    widest = max((v.collision_radius_m for v in scenario.vehicles if v.kind == "multirotor"), default=0.0)
+    (east, north), over = landing_places(site, widest + rules.landing_clearance_m, max(margin, 0.0) + LEASH_M)
     return FailsafeRules(
         fence_low_m=_f32(origin + margin),
         fence_high_m=_f32(end - margin),
@@ -124,6 +127,9 @@ def _failsafes(scenario: Scenario, site: Site) -> FailsafeRules:
         link_range_m=_f32(rules.link.range_m if link else np.inf),
         link_s=_f32(rules.link.after_s),
         return_height_m=_f32(float(np.max(np.asarray(site.surface_m))) + rules.return_clearance_m),
+        clear_east_m=_f32(east),
+        clear_north_m=_f32(north),
+        over_m=_f32(over),
         action=on_host([ACTIONS.get(kind.action, HOLD) for kind in kinds], np.int32),
     )
 

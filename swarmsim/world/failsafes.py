@@ -1,14 +1,15 @@
 """What an autopilot does by itself when a mission goes wrong: hold, return or land, as PX4 and ArduPilot do.
 
 A failsafe is latched: it stays until the vehicle has landed. Of several the one that lands comes before the one that
-returns, and that before the one that holds.
+returns, and that before the one that holds. Where it lands is known beforehand, as are ArduPilot's
+rally points and PX4's safe points: the nearest place of the site that is clear.
 """
 
 import jax
 import jax.numpy as jnp
 
 from swarmsim.pytree import pytree
-from swarmsim.site import Site, sample
+from swarmsim.site import Site, nearest, sample
 from swarmsim.world import events
 
 HOLD, RETURN, LAND = range(3)
@@ -29,6 +30,12 @@ DESCENT_M_S, SLOW_DESCENT_M_S = 1.5, 0.6
 """Rates of descent: PX4's defaults MPC_Z_V_AUTO_DN and, near the ground, MPC_LAND_SPEED."""
 WIND_DESCENT_M_S = 3.0
 """Rate of descent, as far as the vehicle may, out of a wind that carries it off: it is weaker near the ground."""
+CLEAR_ABOVE_M = 2.0
+"""Height above what stands around it at which a vehicle flies to where it can land."""
+CLIMB_OVER_M_S = 1.0
+"""Rate at which it climbs for that."""
+ADRIFT_S = 20.0
+"""For how long the wind may carry it off before it goes down wherever it is."""
 CARRIED_S = 2.0
 """For how long the wind must have carried a vehicle off before it lands early, because the fence is near."""
 
@@ -47,6 +54,9 @@ class FailsafeRules:
     link_range_m: jax.Array  # [] from home, where the ground station is
     link_s: jax.Array  # [] for how long out of range
     return_height_m: jax.Array  # [] world: above everything that stands on the site
+    clear_east_m: jax.Array  # [ny, nx] where, nearest to this cell of the site, one can land clear of what stands there
+    clear_north_m: jax.Array  # [ny, nx]
+    over_m: jax.Array  # [ny, nx] world: highest surface around this cell
     action: jax.Array  # [failsafes] int32: HOLD, RETURN or LAND
 
 
@@ -125,7 +135,13 @@ def rescue_of(
     back = jnp.where(rescue.takes_over, rescue.position_m[:2] - position_m[:2], 0.0)
     kept = position_m[:2] + back * jnp.minimum(1.0, LEASH_M * jax.lax.rsqrt(jnp.sum(back * back) + 1e-12))
     inside = jnp.clip(kept, rules.fence_low_m + LEASH_M, rules.fence_high_m - LEASH_M)
-    level = jnp.where((action == RETURN) & (there | high), home_m, inside)
+    clear = jnp.stack([nearest(raster, site, inside) for raster in (rules.clear_east_m, rules.clear_north_m)])
+    level = jnp.where((action == RETURN) & (there | high), home_m, jnp.where(action == LAND, clear, inside))
+    # Until it is there it stays above what stands around it, as long as the wind lets it.
+    to_go = level - position_m[:2]
+    above = position_m[2] - nearest(rules.over_m, site, position_m[:2]) - CLEAR_ABOVE_M
+    waits = (jnp.sum(to_go * to_go) > ARRIVED_M * ARRIVED_M) & (rescue.carried_s < ADRIFT_S)
+    sink = jnp.where(waits, jnp.minimum(sink, jnp.maximum(above, -CLIMB_OVER_M_S)), sink)
     aim = jnp.where(cruises, jnp.maximum(rules.return_height_m, jnp.where(high, position_m[2], 0.0)), position_m[2])
     ground = sample(site.terrain_m, site, position_m[:2])
     aim = jnp.minimum(aim, ground + rules.ceiling_m)

@@ -10,9 +10,9 @@ import pytest
 from swarmsim.config.errors import InputError
 from swarmsim.control.commands import fly_velocity, go_to
 from swarmsim.world import events
-from swarmsim.world.failsafes import failing, no_rescue
+from swarmsim.world.failsafes import LEASH_M, failing, no_rescue
 from swarmsim.world.judge import record_events
-from tests.world.worlds import airborne, begin, fly, happened, row, with_group, world
+from tests.world.worlds import BUILDING, airborne, begin, fly, happened, row, with_group, world
 
 COUNT = 4
 RULES = {
@@ -116,6 +116,28 @@ def test_too_strong_a_wind_makes_it_land_where_it_is(speed):
     low = tracks[0].position_m[-1]
     assert (low[:, 2] < 0.3).all()
     assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.05
+
+
+@pytest.mark.parametrize("engine", ["analytic", "mjx"])
+def test_one_that_has_to_land_goes_where_nothing_stands(engine):
+    """Over the house, beside its wall, over open ground, and at the fence."""
+    made = world(row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0), sample_period_s={"nai_1p5x1p5": 1.0},
+                 failsafes={"battery": {"action": "land"}, "landing_clearance_m": 2.5}, engine=engine)  # fmt: skip
+    places = np.array([[23.0, 2.0, 12.0], [31.0, -4.0, 3.0], [-10.0, 5.0, 8.0], [39.5, 20.0, 8.0]])
+    up = airborne(made, begin(made, jax.random.key(5)), places)
+    vehicle = up.groups[0].vehicle
+    used = vehicle.energy_j.at[:].set(0.86 * made.groups[0].limits.battery_j)
+    up = with_group(up, 0, vehicle=replace(vehicle, energy_j=used))
+    state, tracks = fly(made, up, (go(places, [0, 0, 0]),), 30.0)
+    assert happened(state) == [{"battery_low"}] * COUNT
+    end = tracks[0].position_m[-1]
+    assert (end[:, 2] < 0.3).all()
+    radius, (west, south, east, north) = 0.386, BUILDING
+    away = np.hypot(np.clip(end[:, 0], west, east) - end[:, 0], np.clip(end[:, 1], south, north) - end[:, 1])
+    assert away.min() > 2.5 + radius - 0.3
+    assert np.linalg.norm(end[2, :2] - places[2, :2]) < 0.3  # where it was
+    assert end[3, 0] < 40.0 - LEASH_M + 0.3
+    assert not state.groups[0].active.any()
 
 
 def test_a_fence_that_shuts_out_a_start_is_told():
