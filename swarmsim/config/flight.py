@@ -80,4 +80,4 @@ class Failsafes(Model):
     battery: BatteryFailsafe = BatteryFailsafe()
     link: LinkFailsafe = LinkFailsafe()
     return_clearance_m: NonNegative = 5.0
-    landing_clearance_m: NonNegative = 2.0
+    landing_clearance_m: float = Field(default=2.0, ge=0.0, le=100.0)
