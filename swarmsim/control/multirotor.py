@@ -184,11 +184,14 @@ def _rotor_speeds_of(
     """Rotor speeds [R] rad/s for body rates [3] rad/s and a collective thrust [] N.
 
     The moment of the air on the rotors is fed forward as in still air: a small vehicle with slow motors, whose
-    attitude control is weak, would swing over its place. What the wind adds is left to the integral.
+    attitude control is weak, would swing over its place. What the wind adds is left to the integral. Beyond the
+    vehicle's own largest speed it is the wind that moves it, whose air does not meet the rotors.
     """
     w, inertia, axes = body.angular_velocity_rad_s, autopilot.inertia_kg_m2, autopilot.principal_axes
     turn = times_inertia(inertia, axes, autopilot.rate_gain_1_s * (rate - w + integral))
     forward, left = (jnp.sum(attitude[:, axis] * body.velocity_m_s) for axis in (0, 1))
+    share = jnp.minimum(1.0, autopilot.speed_max_m_s * jax.lax.rsqrt(forward * forward + left * left + 1e-12))
+    forward, left = share * forward, share * left
     drag, rolling = autopilot.drag_moment_ns, autopilot.rolling_moment_ns
     air = jnp.stack([rolling * forward - drag * left, drag * forward + rolling * left, jnp.zeros_like(forward)])
     torque = turn + jnp.cross(w, times_inertia(inertia, axes, w)) + air

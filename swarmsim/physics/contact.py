@@ -83,13 +83,15 @@ def wall_wrench(
     normal: jax.Array,
     velocity_m_s: jax.Array,
     angular_velocity_rad_s: jax.Array,
+    inertia_kg_m2: jax.Array,
     dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Force [3] N and torque [3] N m about the body's origin (body frame) of an upright wall on the body's rim.
 
     The rim is a circle of ``radius_m`` [] about the body's origin; its point nearest to the wall meets a spring and
-    damper as stiff as a contact point, and Coulomb friction that grows with the slip up to `SLIP_M_S`. ``distance_m``
-    [] is that of the origin from the wall, ``normal`` [3] points out of it (body frame).
+    damper as stiff as a contact point, and Coulomb friction that grows with the slip up to `SLIP_M_S`, but takes no
+    more than the slip off within a step. ``distance_m`` [] is that of the origin from the wall, ``normal`` [3] points
+    out of it (body frame), ``inertia_kg_m2`` [3] are the principal moments.
     """
     arm = -radius_m * normal
     velocity = velocity_m_s + _cross(angular_velocity_rad_s, arm)
@@ -98,7 +100,9 @@ def wall_wrench(
     push = jnp.where(depth > 0.0, _push(points, depth, closing, points.mass_kg / dt), 0.0)
     along = velocity - closing * normal
     slip = jax.lax.rsqrt(jnp.sum(along * along) + SLIP_M_S * SLIP_M_S)
-    force = push * (normal - points.friction * slip * along)
+    inertia = jnp.min(inertia_kg_m2)
+    stops = points.mass_kg * inertia / (inertia + points.mass_kg * radius_m * radius_m) / dt
+    force = push * normal - jnp.minimum(points.friction * slip * push, stops) * along
     return force, _cross(arm, force)
 
 

@@ -147,6 +147,7 @@ def step_loads(
             normal=away,
             velocity_m_s=velocity,
             angular_velocity_rad_s=rate,
+            inertia_kg_m2=params.inertia_kg_m2,
             dt=dt,
         )
         contact_force, contact_torque = contact_force + push, contact_torque + turn

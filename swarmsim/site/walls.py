@@ -82,6 +82,6 @@ def wall_near(walls: Walls, site: Site, xy: jax.Array, height_m: jax.Array) -> t
     distance, east, north = (a + share * (b - a) for a, b in zip(low, high, strict=True))
     square = east * east + north * north
     steep = jax.lax.rsqrt(jnp.maximum(square, 1e-12))
-    flat_here = square < 1e-8  # no wall, or the middle of one: any direction will do
+    flat_here = square < 1e-8  # no wall, the middle of one, where any direction will do, or that of a gap
     normal = jnp.stack([jnp.where(flat_here, 1.0, east * steep), jnp.where(flat_here, 0.0, north * steep)])
-    return jnp.where(level > levels, NOWHERE_M, distance), normal
+    return jnp.where((level > levels) | (flat_here & (distance > 0.0)), NOWHERE_M, distance), normal

@@ -36,6 +36,8 @@ CLIMB_OVER_M_S = 1.0
 """Rate at which it climbs for that."""
 ADRIFT_S = 20.0
 """For how long the wind may carry it off before it goes down wherever it is."""
+SEARCH_S = 90.0
+"""For how long after the last failsafe it makes for such a place, before it goes down wherever it is."""
 CARRIED_S = 2.0
 """For how long the wind must have carried a vehicle off before it lands early, because the fence is near."""
 
@@ -89,6 +91,7 @@ def failing(
 ) -> tuple[jax.Array, Rescue]:  # fmt: skip
     """Which failsafes [failsafes] set in for one vehicle in flight, and its timers.
 
+    One that the wind has carried for `ADRIFT_S` counts as carried from then on, also in the calmer air near the ground.
     The fence is felt ahead: at the distance that braking by ``brake_m_s2`` [] takes. ``above_m`` [] is the height above
     the terrain, ``carried_m_s`` [] the speed at which the wind carries it off, ``charge`` [] what is left of the
     battery, ``home_m`` [2] where it started.
@@ -97,7 +100,8 @@ def failing(
     stop = REACTION_S * velocity_m_s + 0.5 * velocity_m_s * jnp.abs(velocity_m_s) / brake_m_s2
     ahead, up = level + stop[:2], above_m + stop[2]
     outside = jnp.any((ahead < rules.fence_low_m) | (ahead > rules.fence_high_m)) | (up > rules.ceiling_m)
-    carried = jnp.where(carried_m_s > rules.wind_drift_m_s, rescue.carried_s + dt, 0.0)
+    drifts = (carried_m_s > rules.wind_drift_m_s) | (rescue.carried_s > ADRIFT_S)
+    carried = jnp.where(drifts, rescue.carried_s + dt, 0.0)
     away = level - home_m
     far = jnp.sum(away * away) > rules.link_range_m * rules.link_range_m
     unheard = jnp.where(far, rescue.unheard_s + dt, 0.0)
@@ -116,11 +120,17 @@ def failing(
 
 
 def rescue_of(
-    rules: FailsafeRules, rescue: Rescue, times_s: jax.Array, position_m: jax.Array, height_m: jax.Array, site: Site,
-    home_m: jax.Array,
+    rules: FailsafeRules, rescue: Rescue, times_s: jax.Array, now_s: jax.Array, position_m: jax.Array,
+    height_m: jax.Array, push_m: jax.Array, site: Site, home_m: jax.Array,
 ) -> Rescue:  # fmt: skip
-    """What one vehicle's autopilot flies now, from its event times [kinds]; ``height_m`` [] is that of its feet."""
-    set_in = jnp.isfinite(times_s[len(events.LOSSES) :])
+    """What one vehicle's autopilot flies now, from its event times [kinds].
+
+    ``height_m`` [] is that of its feet, ``push_m`` [3] the displacement that keeps it apart from others in flight.
+    """
+    since = times_s[len(events.LOSSES) :]
+    set_in = jnp.isfinite(since)
+    in_vain = now_s - jnp.max(jnp.where(set_in, since, -jnp.inf)) > SEARCH_S
+    in_vain |= rescue.carried_s > ADRIFT_S
     action = jnp.max(jnp.where(set_in, rules.action, -1))
     away = position_m[:2] - home_m
     there = jnp.sum(away * away) < ARRIVED_M * ARRIVED_M
@@ -129,18 +139,26 @@ def rescue_of(
     cruises = (action == RETURN) & ~there
     blown = set_in[events.WIND - len(events.LOSSES)]
     outside = jnp.any((position_m[:2] < rules.fence_low_m) | (position_m[:2] > rules.fence_high_m))
-    near = jnp.where(outside & blown, 0.0, SLOW_DESCENT_M_S)  # low above the ground it can fly back before it lands
+    near = jnp.where(
+        outside & blown & ~in_vain, 0.0, SLOW_DESCENT_M_S
+    )  # low above the ground it can fly back before it lands
     sink = jnp.where(height_m > SLOW_BELOW_M, jnp.where(blown, WIND_DESCENT_M_S, DESCENT_M_S), near)
     # The place is kept while the vehicle holds or lands; one that the wind carries off does not race back to it.
     back = jnp.where(rescue.takes_over, rescue.position_m[:2] - position_m[:2], 0.0)
     kept = position_m[:2] + back * jnp.minimum(1.0, LEASH_M * jax.lax.rsqrt(jnp.sum(back * back) + 1e-12))
     inside = jnp.clip(kept, rules.fence_low_m + LEASH_M, rules.fence_high_m - LEASH_M)
-    clear = jnp.stack([nearest(raster, site, inside) for raster in (rules.clear_east_m, rules.clear_north_m)])
-    level = jnp.where((action == RETURN) & (there | high), home_m, jnp.where(action == LAND, clear, inside))
-    # Until it is there it stays above what stands around it, as long as the wind lets it.
-    to_go = level - position_m[:2]
+    aside = inside + push_m[:2]
+    clear = jnp.stack([nearest(raster, site, aside) for raster in (rules.clear_east_m, rules.clear_north_m)])
+    to_go = clear - position_m[:2]
+    waits = (jnp.sum(to_go * to_go) > ARRIVED_M * ARRIVED_M) & ~in_vain
+    # Until it is there it stays above what stands around it, and goes there no faster than it can climb over that.
     above = position_m[2] - nearest(rules.over_m, site, position_m[:2]) - CLEAR_ABOVE_M
-    waits = (jnp.sum(to_go * to_go) > ARRIVED_M * ARRIVED_M) & (rescue.carried_s < ADRIFT_S)
+    low = waits & (above < -CLIMBED_M) & (rescue.carried_s <= 0.0)
+    to_go = clear - inside
+    clear = inside + to_go * jnp.minimum(1.0, LEASH_M * jax.lax.rsqrt(jnp.sum(to_go * to_go) + 1e-12))
+    level = jnp.where((action == RETURN) & (there | high), home_m, inside)
+    level = jnp.where((action == LAND) & ~low, clear, level)
+    waits &= action == LAND
     sink = jnp.where(waits, jnp.minimum(sink, jnp.maximum(above, -CLIMB_OVER_M_S)), sink)
     aim = jnp.where(cruises, jnp.maximum(rules.return_height_m, jnp.where(high, position_m[2], 0.0)), position_m[2])
     ground = sample(site.terrain_m, site, position_m[:2])

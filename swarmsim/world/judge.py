@@ -74,7 +74,10 @@ def record_events(
     times = events.record(state.event_time_s, happened, now_s)
     active = state.active
     if rescue is not None:
-        rescue = rescue_of(world.failsafes, rescue, times, body.position_m, height, world.site, limits.home_m)
+        rescue = rescue_of(
+            world.failsafes, rescue, times, now_s, body.position_m, height, state.around.push_m, world.site,
+            limits.home_m,
+        )  # fmt: skip
         still = jnp.sum(body.velocity_m_s**2) < AT_REST_M_S**2  # it may slide on a little with its motors off
         active = active & ~(events.rescued(times) & kind.landed(state.control) & still)
     around = replace(state.around, rescue=rescue)

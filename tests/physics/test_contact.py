@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmsim.physics.contact import PART_M_S, ContactPoints, contact_wrench
+from swarmsim.physics.contact import PART_M_S, ContactPoints, contact_wrench, wall_wrench
 
 DT = 0.005
 UP = jnp.array([0.0, 0.0, 1.0])
@@ -79,3 +79,19 @@ def test_no_depth_throws_the_body_back(depth, speed):
     """One step after it has come to be ``depth`` m deep at ``speed`` m/s, up is positive."""
     force, _, _ = contact(-depth, (0.0, 0.0, speed))
     assert speed + DT * float(force[2]) / 3.5 <= max(speed, PART_M_S) + 1e-3
+
+
+@given(*(st.floats(-6.0, 6.0) for _ in range(3)), *(st.floats(-20.0, 20.0) for _ in range(3)), st.floats(0.0, 0.4))
+def test_a_wall_gives_no_energy_but_what_parts_from_it(vx, vy, vz, wx, wy, wz, depth):
+    """A step of free motion under the wall's force: friction takes the slip off at most, however hard the push is."""
+    radius, mass, inertia = 0.5, 3.5, np.array([0.06, 0.05, 0.09])
+    velocity, rate = np.array([vx, vy, vz]), np.array([wx, wy, wz])
+    force, torque = wall_wrench(
+        FEET, radius_m=jnp.float32(radius), distance_m=jnp.float32(radius - depth), normal=jnp.array([1.0, 0.0, 0.0]),
+        velocity_m_s=jnp.asarray(velocity, jnp.float32), angular_velocity_rad_s=jnp.asarray(rate, jnp.float32),
+        inertia_kg_m2=jnp.asarray(inertia, jnp.float32), dt=DT,
+    )  # fmt: skip
+    after, turned = velocity + DT * np.asarray(force) / mass, rate + DT * np.asarray(torque) / inertia
+    energy = [0.5 * mass * v @ v + 0.5 * inertia @ w**2 for v, w in ((velocity, rate), (after, turned))]
+    assert energy[1] <= energy[0] * (1 + 1e-4) + 0.5 * mass * PART_M_S**2
+    assert float(force[0]) >= 0.0

@@ -10,7 +10,7 @@ import pytest
 from swarmsim.config.errors import InputError
 from swarmsim.control.commands import fly_velocity, go_to
 from swarmsim.world import events
-from swarmsim.world.failsafes import LEASH_M, failing, no_rescue
+from swarmsim.world.failsafes import CLIMB_OVER_M_S, LAND, LEASH_M, SEARCH_S, failing, no_rescue, rescue_of
 from swarmsim.world.judge import record_events
 from tests.world.worlds import BUILDING, airborne, begin, fly, happened, row, with_group, world
 
@@ -138,6 +138,38 @@ def test_one_that_has_to_land_goes_where_nothing_stands(engine):
     assert np.linalg.norm(end[2, :2] - places[2, :2]) < 0.3  # where it was
     assert end[3, 0] < 40.0 - LEASH_M + 0.3
     assert not state.groups[0].active.any()
+
+
+def test_two_that_have_to_land_from_over_one_house_take_a_place_each():
+    made = world(row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0), sample_period_s={"nai_1p5x1p5": 1.0},
+                 failsafes={"battery": {"action": "land"}})  # fmt: skip
+    places = np.array([[28.0, 1.0, 9.0], [28.0, -2.0, 9.0], [26.0, 6.0, 11.0], [22.0, -6.0, 9.0]])
+    up = airborne(made, begin(made, jax.random.key(5)), places)
+    vehicle = up.groups[0].vehicle
+    up = with_group(up, 0, vehicle=replace(vehicle, energy_j=0.86 * jnp.asarray(made.groups[0].limits.battery_j)))
+    state, tracks = fly(made, up, (go(places, [0, 0, 0]),), 40.0)
+    assert happened(state) == [{"battery_low"}] * COUNT
+    end = tracks[0].position_m[-1]
+    assert (end[:, 2] < 0.3).all()
+    apart = np.linalg.norm(end[:, None, :2] - end[None, :, :2], axis=-1)[np.triu_indices(COUNT, 1)]
+    assert apart.min() > 2 * 0.386
+
+
+@pytest.mark.parametrize(("late_s", "climb"), [(10.0, CLIMB_OVER_M_S), (SEARCH_S + 1.0, -0.6)])
+def test_on_its_way_to_a_clear_place_it_climbs_first_but_not_for_ever(late_s, climb):
+    """2 m up, 0.5 m from the house of 6 m."""
+    made = world(row("uav", "x500", 1, (0.0, 0.0)))
+    times = np.full(len(events.KINDS), np.inf, np.float32)
+    times[events.KINDS.index("wind")] = 5.0
+    position = jnp.array([BUILDING[0] - 0.5, 0.0, 2.0])
+    found = rescue_of(
+        made.failsafes, replace(no_rescue(), takes_over=jnp.array(True), position_m=position), jnp.asarray(times),
+        jnp.float32(5.0 + late_s), position, jnp.float32(1.8), jnp.zeros(3), made.site, jnp.zeros(2),
+    )  # fmt: skip
+    assert made.failsafes.action[events.FAILSAFES.index("wind")] == LAND
+    assert float(found.velocity_m_s[2]) == pytest.approx(climb)
+    if climb > 0.0:
+        np.testing.assert_allclose(found.position_m[:2], position[:2])  # and only then to the side
 
 
 def test_a_fence_that_shuts_out_a_start_is_told():

@@ -138,3 +138,16 @@ def test_two_that_lie_in_each_other_come_apart_and_rest(place):
     assert gap.min() > 2 * RADIUS_M - TOUCH_M - 1e-3
     assert gap.max() < 2 * RADIUS_M + 0.1  # parted, not thrown
     assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.02
+
+
+def test_between_two_walls_one_comes_to_rest():
+    """In slots of 1.25 to 2.25 m, whose middle has no nearest wall."""
+    slots = [(-20.0 + 12.0 * k, 1.25 + 0.25 * k) for k in range(5)]
+    blocks = [(x - 3.0, -5.0, x, 5.0) for x, _ in slots] + [(x + gap, -5.0, x + gap + 3.0, 5.0) for x, gap in slots]
+    made = world(row("uav", "x500", 5, (-30.0, -20.0)), blocks=tuple(blocks), sample_period_s={"nai_1p5x1p5": 1.0})
+    over = np.array([[x + 0.5 * gap + 0.1, 0.0, 5.0] for x, gap in slots])
+    state = airborne(made, begin(made, jax.random.key(1)), over)
+    vehicle = state.groups[0].vehicle
+    state = with_group(state, 0, vehicle=replace(vehicle, rotor_speed_rad_s=jnp.zeros((5, 4))))
+    _, tracks = fly(made, state, (off(5),), 12.0)
+    assert np.abs(tracks[0].velocity_m_s[-100:]).max() < 0.1
