@@ -141,3 +141,26 @@ def test_a_batch_of_missions_that_share_their_clock_equals_its_missions(fields, 
         assert_close(mission(state.groups, number), expected.groups)
         assert_close(mission(reading, number), read)
         assert_close(mission(state.radio, number), expected.radio)
+
+
+def largest(jaxpr, count):
+    """Number of elements, for each of ``count`` missions, of the largest array that a program computes for all."""
+    sizes = [0]
+    for equation in jaxpr.eqns:
+        shapes = [out.aval.shape for out in equation.outvars]
+        sizes += [int(np.prod(shape[1:])) for shape in shapes if shape[:1] == (count,)]
+        for value in equation.params.values():
+            parts = value if isinstance(value, tuple | list) else [value]
+            programs = [getattr(part, "jaxpr", part) for part in parts]
+            sizes += [largest(part, count) for part in programs if hasattr(part, "eqns")]
+    return max(sizes)
+
+
+@pytest.mark.parametrize("in_kernels", [True, False])
+def test_a_batch_of_missions_copies_no_raster(monkeypatch, fields, begun, commands, in_kernels):
+    """On a GPU. On a CPU the conditions stay, which copy what they read: the test would see it."""
+    monkeypatch.setattr(stepping, "_in_kernels", lambda: in_kernels)
+    field = replace(fields[0], layout="scalars")
+    every = jax.vmap(lambda state: step(field, state, commands)[0])
+    program = jax.make_jaxpr(every)(stacked(begun)).jaxpr
+    assert (largest(program, len(begun)) < field.site.terrain_m.size) == in_kernels
