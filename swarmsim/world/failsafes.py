@@ -139,27 +139,16 @@ def rescue_of(
     cruises = (action == RETURN) & ~there
     blown = set_in[events.WIND - len(events.LOSSES)]
     outside = jnp.any((position_m[:2] < rules.fence_low_m) | (position_m[:2] > rules.fence_high_m))
-    near = jnp.where(
-        outside & blown & ~in_vain, 0.0, SLOW_DESCENT_M_S
-    )  # low above the ground it can fly back before it lands
+    # Low above the ground it can fly back before it lands.
+    near = jnp.where(outside & blown & ~in_vain, 0.0, SLOW_DESCENT_M_S)
     sink = jnp.where(height_m > SLOW_BELOW_M, jnp.where(blown, WIND_DESCENT_M_S, DESCENT_M_S), near)
     # The place is kept while the vehicle holds or lands; one that the wind carries off does not race back to it.
     back = jnp.where(rescue.takes_over, rescue.position_m[:2] - position_m[:2], 0.0)
     kept = position_m[:2] + back * jnp.minimum(1.0, LEASH_M * jax.lax.rsqrt(jnp.sum(back * back) + 1e-12))
     inside = jnp.clip(kept, rules.fence_low_m + LEASH_M, rules.fence_high_m - LEASH_M)
-    aside = inside + push_m[:2]
-    clear = jnp.stack([nearest(raster, site, aside) for raster in (rules.clear_east_m, rules.clear_north_m)])
-    to_go = clear - position_m[:2]
-    waits = (jnp.sum(to_go * to_go) > ARRIVED_M * ARRIVED_M) & ~in_vain
-    # Until it is there it stays above what stands around it, and goes there no faster than it can climb over that.
-    above = position_m[2] - nearest(rules.over_m, site, position_m[:2]) - CLEAR_ABOVE_M
-    low = waits & (above < -CLIMBED_M) & (rescue.carried_s <= 0.0)
-    to_go = clear - inside
-    clear = inside + to_go * jnp.minimum(1.0, LEASH_M * jax.lax.rsqrt(jnp.sum(to_go * to_go) + 1e-12))
-    level = jnp.where((action == RETURN) & (there | high), home_m, inside)
-    level = jnp.where((action == LAND) & ~low, clear, level)
-    waits &= action == LAND
-    sink = jnp.where(waits, jnp.minimum(sink, jnp.maximum(above, -CLIMB_OVER_M_S)), sink)
+    clear, climb = _to_clear_place(rules, site, position_m, inside, push_m[:2], rescue.carried_s <= 0.0)
+    level = jnp.where((action == RETURN) & (there | high), home_m, jnp.where(action == LAND, clear, inside))
+    sink = jnp.where((action == LAND) & ~in_vain, jnp.minimum(sink, -climb), sink)
     aim = jnp.where(cruises, jnp.maximum(rules.return_height_m, jnp.where(high, position_m[2], 0.0)), position_m[2])
     ground = sample(site.terrain_m, site, position_m[:2])
     aim = jnp.minimum(aim, ground + rules.ceiling_m)
@@ -170,3 +159,21 @@ def rescue_of(
         carried_s=rescue.carried_s,
         unheard_s=rescue.unheard_s,
     )
+
+
+def _to_clear_place(
+    rules: FailsafeRules, site: Site, position_m: jax.Array, place_m: jax.Array, aside_m: jax.Array, holds: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Where [2] to fly on the way to the clear place nearest to ``place_m`` [2], and the least climb rate [] for that.
+
+    Above what stands around it, and no faster than it can climb over that. A vehicle that ``holds`` [] against the wind
+    climbs first. ``aside_m`` [2] keeps those apart that have the same place.
+    """
+    aside = place_m + aside_m
+    clear = jnp.stack([nearest(raster, site, aside) for raster in (rules.clear_east_m, rules.clear_north_m)])
+    to_go, ahead = clear - position_m[:2], clear - place_m
+    arrived = jnp.sum(to_go * to_go) < ARRIVED_M * ARRIVED_M
+    above = position_m[2] - nearest(rules.over_m, site, position_m[:2]) - CLEAR_ABOVE_M
+    reach = jnp.where(~arrived & holds & (above < -CLIMBED_M), 0.0, LEASH_M)
+    level = place_m + ahead * jnp.minimum(1.0, reach * jax.lax.rsqrt(jnp.sum(ahead * ahead) + 1e-12))
+    return level, jnp.where(arrived, -jnp.inf, jnp.minimum(-above, CLIMB_OVER_M_S))
