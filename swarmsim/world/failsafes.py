@@ -1,8 +1,8 @@
 """What an autopilot does by itself when a mission goes wrong: hold, return or land, as PX4 and ArduPilot do.
 
 A failsafe is latched: it stays until the vehicle has landed. Of several the one that lands comes before the one that
-returns, and that before the one that holds. Where it lands is known beforehand, as are ArduPilot's
-rally points and PX4's safe points: the nearest place of the site that is clear.
+returns, and that before the one that holds. Where it lands is known beforehand, as are ArduPilot's rally points and
+PX4's safe points: the nearest place of the site that is clear.
 """
 
 import jax
@@ -91,7 +91,7 @@ def failing(
 ) -> tuple[jax.Array, Rescue]:  # fmt: skip
     """Which failsafes [failsafes] set in for one vehicle in flight, and its timers.
 
-    One that the wind has carried for `ADRIFT_S` counts as carried from then on, also in the calmer air near the ground.
+    One in a failsafe that the wind has carried for `ADRIFT_S` counts as carried from then on, also in calmer air.
     The fence is felt ahead: at the distance that braking by ``brake_m_s2`` [] takes. ``above_m`` [] is the height above
     the terrain, ``carried_m_s`` [] the speed at which the wind carries it off, ``charge`` [] what is left of the
     battery, ``home_m`` [2] where it started.
@@ -100,7 +100,7 @@ def failing(
     stop = REACTION_S * velocity_m_s + 0.5 * velocity_m_s * jnp.abs(velocity_m_s) / brake_m_s2
     ahead, up = level + stop[:2], above_m + stop[2]
     outside = jnp.any((ahead < rules.fence_low_m) | (ahead > rules.fence_high_m)) | (up > rules.ceiling_m)
-    drifts = (carried_m_s > rules.wind_drift_m_s) | (rescue.carried_s > ADRIFT_S)
+    drifts = (carried_m_s > rules.wind_drift_m_s) | (rescue.takes_over & (rescue.carried_s > ADRIFT_S))
     carried = jnp.where(drifts, rescue.carried_s + dt, 0.0)
     away = level - home_m
     far = jnp.sum(away * away) > rules.link_range_m * rules.link_range_m

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import swarmsim
 from swarmsim.config.errors import InputError
 from swarmsim.control.commands import fly_velocity, go_to
 from swarmsim.world import events
-from swarmsim.world.failsafes import CLIMB_OVER_M_S, LAND, LEASH_M, SEARCH_S, failing, no_rescue, rescue_of
+from swarmsim.world.failsafes import ADRIFT_S, CLIMB_OVER_M_S, LAND, LEASH_M, SEARCH_S, failing, no_rescue, rescue_of
 from swarmsim.world.judge import record_events
 from tests.world.worlds import BUILDING, airborne, begin, fly, happened, row, with_group, world
 
@@ -141,9 +142,10 @@ def test_one_that_has_to_land_goes_where_nothing_stands(engine):
 
 
 def test_two_that_have_to_land_from_over_one_house_take_a_place_each():
+    """The same place beyond the house's north end is the nearest one for both."""
     made = world(row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0), sample_period_s={"nai_1p5x1p5": 1.0},
                  failsafes={"battery": {"action": "land"}})  # fmt: skip
-    places = np.array([[28.0, 1.0, 9.0], [28.0, -2.0, 9.0], [26.0, 6.0, 11.0], [22.0, -6.0, 9.0]])
+    places = np.array([[25.0, 9.0, 9.0], [25.0, 6.0, 9.0], [-10.0, 5.0, 8.0], [-20.0, 0.0, 8.0]])
     up = airborne(made, begin(made, jax.random.key(5)), places)
     vehicle = up.groups[0].vehicle
     up = with_group(up, 0, vehicle=replace(vehicle, energy_j=0.86 * jnp.asarray(made.groups[0].limits.battery_j)))
@@ -170,6 +172,42 @@ def test_on_its_way_to_a_clear_place_it_climbs_first_but_not_for_ever(late_s, cl
     assert float(found.velocity_m_s[2]) == pytest.approx(climb)
     if climb > 0.0:
         np.testing.assert_allclose(found.position_m[:2], position[:2])  # and only then to the side
+
+
+@pytest.mark.parametrize(
+    ("takes_over", "carried_s", "kept"), [(True, 21.0, True), (False, 21.0, False), (True, 9.0, False)]
+)
+def test_only_one_in_a_failsafe_that_was_adrift_counts_as_carried_in_calmer_air(takes_over, carried_s, kept):
+    """A wind failsafe after 60 s must not set in because of a gust of 21 s."""
+    rules = world(row("uav", "x500", 1, (0.0, 0.0)), failsafes={"wind": {"after_s": 60.0}}).failsafes
+    before = replace(no_rescue(), takes_over=jnp.array(takes_over), carried_s=jnp.float32(carried_s))
+    found, after = failing(
+        rules, before, position_m=jnp.array([0.0, 0.0, 5.0]), velocity_m_s=jnp.zeros(3), brake_m_s2=jnp.float32(4.0),
+        above_m=jnp.float32(5.0), carried_m_s=jnp.float32(0.0), charge=jnp.float32(1.0), home_m=jnp.zeros(2), dt=0.05,
+    )  # fmt: skip
+    assert float(after.carried_s) == pytest.approx(carried_s + 0.05 if kept else 0.0)
+    assert not found.any()
+
+
+@pytest.mark.parametrize(("carried_s", "sinks"), [(5.0, False), (ADRIFT_S + 1.0, True)])
+def test_one_that_is_adrift_beyond_the_fence_lands_there(carried_s, sinks):
+    """3 m above open ground: it flies back as long as it can hope to."""
+    made = world(row("uav", "x500", 1, (0.0, 0.0)))
+    times = np.full(len(events.KINDS), np.inf, np.float32)
+    times[events.KINDS.index("wind")] = 5.0
+    position = jnp.array([float(made.failsafes.fence_high_m[0]) + 5.0, 20.0, 3.0])
+    rescue = replace(
+        no_rescue(), takes_over=jnp.array(True), position_m=position - 5.0, carried_s=jnp.float32(carried_s)
+    )
+    found = rescue_of(made.failsafes, rescue, jnp.asarray(times), jnp.float32(30.0), position, jnp.float32(2.8),
+                      jnp.zeros(3), made.site, jnp.zeros(2))  # fmt: skip
+    assert bool(found.velocity_m_s[2] < -0.5) == sinks
+    assert float(found.position_m[0]) < float(made.failsafes.fence_high_m[0])
+
+
+def test_a_clearance_beyond_its_bound_is_refused():
+    with pytest.raises(InputError, match="landing_clearance_m"):
+        swarmsim.load("recon", ["failsafes.landing_clearance_m=1e308"])
 
 
 def test_a_fence_that_shuts_out_a_start_is_told():
