@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from swarmsim.radiation import net_rate
 from swarmsim.results.summary import batch_row
 from swarmsim.runtime.progress import RichProgress
-from swarmsim.site import path_lengths
+from swarmsim.site import crossed
 
 HEIGHT_M = 20.0  # height above the source at which the net rate is stated
 
@@ -76,8 +76,8 @@ def net_rate_above_source(simulation: swarmsim.Simulation) -> float:
     assert counter is not None  # the survey UAVs carry detectors
     source = jax.tree.map(lambda leaf: leaf[0], world.sources)
     place = source.position_m + jnp.array([0.0, 0.0, HEIGHT_M])
-    lengths = path_lengths(world.site, source.position_m, place)
-    return float(net_rate(counter.detector, source, lengths, place, counter.mount_axis[0], uncollided=True))
+    way = crossed(world.site, source.position_m, place)
+    return float(net_rate(counter.detector, source, way, place, counter.mount_axis[0], uncollided=True))
 
 
 def compare(rows: list[dict[str, object]], figures: tuple[Figure, ...]) -> list[list[str]]:

@@ -128,7 +128,7 @@ def _file_rows(kind: str) -> Iterator[tuple[str, str, str]]:
 def _describe(kind: str, model: Any) -> str:
     match kind:
         case "detectors":
-            return f"{model.crystal}, {model.diameter_mm:g} mm x {model.length_mm:g} mm"
+            return f"{model.crystal or 'counter'}, {model.diameter_mm:g} mm x {model.length_mm:g} mm"
         case "nuclides":
             strongest = sorted(model.lines, key=lambda line: -line.yield_percent)[:3]
             return ", ".join(f"{line.energy_kev:g} keV ({line.yield_percent:g} %)" for line in strongest)
@@ -143,7 +143,7 @@ def copy_configurations(folder: Path) -> None:
     told = file_errors_told("the configurations cannot be copied there", file=str(target))
     with told, atomic_folder(target, _check_new) as copy:
         # Scripts that generate shipped data are not configuration. The temporary folder may lie within the source.
-        leave_out = shutil.ignore_patterns("*.py", "__pycache__", ".*")
+        leave_out = shutil.ignore_patterns("*.py", "elements", "__pycache__", ".*")
         shutil.copytree(files.packaged_dir(), copy, ignore=leave_out, dirs_exist_ok=True)
     count = sum(1 for path in target.rglob("*") if path.is_file())
     go = "" if folder.resolve() == Path.cwd() else f"cd {folder} && "

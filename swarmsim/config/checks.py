@@ -160,7 +160,7 @@ def _check_materials(scenario: Scenario) -> Iterator[Problem]:
     site, materials = scenario.site, scenario.materials
     wanted = [("site", f"the site '{site.name}' is made of", name) for name in _site_materials(site)]
     for detector in scenario.detectors.values():
-        for name in (detector.crystal, detector.housing.material):
+        for name in filter(None, (detector.crystal, detector.housing.material)):
             wanted.append(("vehicles", f"the detector '{detector.name}' is made of", name))
     for where, who, name in wanted:
         if name not in materials:

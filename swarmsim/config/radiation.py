@@ -7,6 +7,15 @@ from pydantic import Field, model_validator
 
 from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec3
 
+ELEMENTS = frozenset(
+    """
+    H He Li Be B C N O F Ne Na Mg Al Si P S Cl Ar K Ca Sc Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge As Se Br Kr Rb Sr Y Zr
+    Nb Mo Tc Ru Rh Pd Ag Cd In Sn Sb Te I Xe Cs Ba La Ce Pr Nd Pm Sm Eu Gd Tb Dy Ho Er Tm Yb Lu Hf Ta W Re Os Ir
+    Pt Au Hg Tl Pb Bi Po At Rn Fr Ra Ac Th Pa U Np Pu Am Cm Bk Cf
+    """.split()  # noqa: SIM905 - as a list it would be a hundred lines
+)
+"""Symbols of the elements with cross sections."""
+
 
 class Line(Model):
     """One gamma or X-ray line: photon energy and photons per hundred decays."""
@@ -27,47 +36,33 @@ class Nuclide(Model):
     source: str
 
 
-class BuildUp(Model):
-    """Number build-up (photons above 30 keV) of one material at one energy, t mean free paths deep.
-
-    B = 1 + C t (1 + t / 0.2)^P exp(D t): Berger's form with one factor more; leave P out for Berger's own.
-    """
-
-    energy_kev: Positive
-    c: NonNegative
-    d: float = Field(gt=-1, lt=0.9)
-    p: float = Field(default=0.0, gt=-3, lt=3)
-
-
 class Material(Model):
-    """A material (``configs/materials/<name>.yaml``): bulk density and mass attenuation against energy.
+    """A material (``configs/materials/<name>.yaml``): bulk density and composition by mass.
 
-    An energy written twice is an absorption edge: the first value holds below it, the second above. The last two
-    fields are needed only to derive ``build_up`` with ``configs/materials/generate_build_up.py`` of the repository.
+    Attenuation and scattering follow from the composition and the elements' cross sections.
     """
 
     name: Name
-    density_kg_m3: Positive
-    energy_kev: tuple[Positive, ...] = Field(min_length=2)
-    mass_attenuation_cm2_g: tuple[Positive, ...] = Field(min_length=2)
-    build_up: tuple[BuildUp, ...] = Field(min_length=1)
+    density_kg_m3: float = Field(gt=0, le=25_000)
+    composition: dict[str, float] = Field(min_length=1, max_length=40)
     source: str
-    mass_energy_absorption_cm2_g: tuple[Positive, ...] | None = None
-    electrons_mol_g: float | None = Field(default=None, gt=0, le=1)
+
+    @property
+    def mass_fractions(self) -> dict[str, float]:
+        """The composition, with a sum of one."""
+        total = sum(self.composition.values())
+        return {symbol: share / total for symbol, share in self.composition.items()}
 
     @model_validator(mode="after")
-    def _aligned(self) -> "Material":
-        energies = self.energy_kev
-        for name in ("mass_attenuation_cm2_g", "mass_energy_absorption_cm2_g"):
-            values = getattr(self, name)
-            if values is not None and len(values) != len(energies):
-                raise ValueError(f"energy_kev has {len(energies)} values and {name} has {len(values)}: make them equal")
-        if any(b < a for a, b in pairwise(energies)):
-            raise ValueError("energy_kev must increase (an energy written twice is an absorption edge)")
-        if any(energies.count(e) > 2 for e in energies):
-            raise ValueError("energy_kev may hold an energy at most twice (below and above an absorption edge)")
-        if any(b.energy_kev <= a.energy_kev for a, b in pairwise(self.build_up)):
-            raise ValueError("the energies of build_up must increase")
+    def _known_elements(self) -> "Material":
+        unknown = [symbol for symbol in self.composition if symbol not in ELEMENTS]
+        if unknown:
+            raise ValueError(f"composition has no element {', '.join(unknown)}: use the symbols H to Cf, such as Fe")
+        if any(not 0.0 < share <= 1.0 for share in self.composition.values()):
+            raise ValueError("the mass fractions of composition must lie above 0 and be at most 1")
+        if not 0.98 <= sum(self.composition.values()) <= 1.02:
+            total = sum(self.composition.values())
+            raise ValueError(f"the mass fractions of composition must add up to 1 (they add up to {total:.4g})")
         return self
 
 
@@ -88,17 +83,10 @@ class DeadTime(Model):
 
 
 class EfficiencyPoint(Model):
-    """Parallel-beam end-on efficiency of the bare crystal at one energy, all pulses > 30 keV and full-energy ones."""
+    """Counts per photon that meets a counter without energy resolution, at one energy."""
 
     energy_kev: Positive
-    total: float = Field(gt=0, le=1)
-    photopeak: float = Field(gt=0, le=1)
-
-    @model_validator(mode="after")
-    def _peak_within_total(self) -> "EfficiencyPoint":
-        if self.photopeak > self.total:
-            raise ValueError("photopeak must not exceed total")
-        return self
+    efficiency: float = Field(gt=0, le=1)
 
 
 class Housing(Model):
@@ -145,24 +133,37 @@ class Spectrometer(Model):
 
 
 class Detector(Model):
-    """A cylindrical scintillator (``configs/detectors/<name>.yaml``)."""
+    """A cylindrical detector (``configs/detectors/<name>.yaml``).
+
+    A scintillator names the material of its ``crystal``, from which and from whose dimensions its efficiency and its
+    pulse heights follow, and has a ``spectrometer``. A counter without energy resolution, such as a Geiger-Mueller
+    tube, gives its ``efficiency`` instead.
+    """
 
     name: Name
-    crystal: Name
-    diameter_mm: Positive
-    length_mm: Positive
-    efficiency: tuple[EfficiencyPoint, ...] = Field(min_length=2)
+    crystal: Name | None = None
+    efficiency: tuple[EfficiencyPoint, ...] | None = Field(default=None, min_length=2, max_length=200)
+    diameter_mm: float = Field(gt=0, le=2000)
+    length_mm: float = Field(gt=0, le=2000)
     housing: Housing
     background: Background
     dead_time: DeadTime
-    sample_period_s: Positive
-    spectrometer: Spectrometer
+    sample_period_s: float = Field(gt=0, le=3600)
+    spectrometer: Spectrometer | None = None
+    backscatter_share: Fraction = 0.0
     sources: dict[str, str]
 
     @model_validator(mode="after")
     def _complete(self) -> "Detector":
-        if any(b.energy_kev <= a.energy_kev for a, b in pairwise(self.efficiency)):
-            raise ValueError("the energies of efficiency must increase")
+        if (self.crystal is None) == (self.efficiency is None):
+            raise ValueError("give crystal (a scintillator) or efficiency (a counter without energy resolution)")
+        if self.crystal is not None and self.spectrometer is None:
+            raise ValueError("a scintillator needs its spectrometer")
+        if self.efficiency is not None:
+            if self.spectrometer is not None:
+                raise ValueError("a counter with an efficiency table has no energy resolution: remove spectrometer")
+            if any(b.energy_kev <= a.energy_kev for a, b in pairwise(self.efficiency)):
+                raise ValueError("the energies of efficiency must increase")
         return self
 
 

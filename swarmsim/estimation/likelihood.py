@@ -15,7 +15,7 @@ from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector, Source, net_rate, observed_rate
 from swarmsim.site import Site, sample, sample_with_gradient
-from swarmsim.site.horizon import BLOCK, Ceilings, ceilings, path_lengths_from
+from swarmsim.site.rays import BLOCK, crossed_from
 
 STEP_SHARE = 0.05  # step of the central differences over the distance of the nearest window: a relative error of 0.25 %
 STEP_M = (0.02, 1.0)  # shortest and longest step
@@ -28,7 +28,6 @@ class FitProblem:
     """Everything a likelihood is conditioned on."""
 
     site: Site
-    above: Ceilings  # of the site
     detectors: tuple[Detector, ...]
     measurements: Measurements
     nuclide: jax.Array  # [] int32 index in the library's order
@@ -60,30 +59,27 @@ def net_rates(
     m: Measurements,
     position_m: jax.Array,
     nuclide: jax.Array,
-    above: Ceilings | None = None,
     rays: int = 1,
 ) -> jax.Array:
     """Net rate [n] in counts/s per becquerel of a source at ``position_m`` [3] in each measurement's detector.
 
     The mean over the way of the crystal during the measurement, by a ray to the middle of each of ``rays`` equal parts
-    of it: within each, 1/r² is integrated in closed form and the rest taken as constant. ``above`` is the site's
-    pyramid of `ceilings`, where the caller has it already. Rows that are not valid have some rate or zero. Order rows
-    as `in_blocks` does: only the rays of valid rows cost time, and each only for its own detector (except under `vmap`,
-    where a `cond` evaluates both branches).
+    of it: within each, 1/r² is integrated in closed form and the rest taken as constant. Rows that are not valid have
+    some rate or zero. Order rows as `in_blocks` does: only the rays of valid rows cost time, and each only for its own
+    detector (except under `vmap`, where a `cond` evaluates both branches).
     """
-    above = ceilings(site) if above is None else above
     source = Source(position_m=position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
     middle = (jnp.arange(rays) + 0.5) / rays - 0.5
 
     def of_block(block: Measurements) -> jax.Array:
         crystal = (block.position_m[:, None] + middle[:, None] * block.travel_m[:, None]).reshape(-1, 3)
-        axis, way = (jnp.repeat(x, rays, axis=0) for x in (block.axis, block.travel_m / rays))
-        lengths = path_lengths_from(site, above, position_m, crystal)
-        gain = travel_gain(crystal - position_m, way)
+        axis, travel = (jnp.repeat(x, rays, axis=0) for x in (block.axis, block.travel_m / rays))
+        way = crossed_from(site, position_m, crystal)
+        gain = travel_gain(crystal - position_m, travel)
 
         def rate(detector: Detector) -> jax.Array:
             each = jax.vmap(lambda through, place, axis: net_rate(detector, source, through, place, axis))
-            return jnp.mean((each(lengths, crystal, axis) * gain).reshape(-1, rays), axis=1)
+            return jnp.mean((each(way, crystal, axis) * gain).reshape(-1, rays), axis=1)
 
         def of_own(number: int, detector: Detector) -> jax.Array:
             used = jnp.any(block.valid & (block.detector == number))
@@ -111,9 +107,7 @@ def in_blocks(m: Measurements) -> jax.Array:
 
 def exact_rates(problem: FitProblem, position_m: jax.Array) -> jax.Array:
     """Net rate [n] per becquerel of the source sought at ``position_m`` [3]."""
-    return net_rates(
-        problem.site, problem.detectors, problem.measurements, position_m, problem.nuclide, problem.above, problem.rays
-    )
+    return net_rates(problem.site, problem.detectors, problem.measurements, position_m, problem.nuclide, problem.rays)
 
 
 def travel_gain(offset_m: jax.Array, travel_m: jax.Array) -> jax.Array:
@@ -245,7 +239,6 @@ def fisher_information(
     theta = jnp.stack([position_m[0], position_m[1], height, jnp.log(activity_bq), jnp.log(scale)])
     problem = FitProblem(
         site=site,
-        above=ceilings(site),
         detectors=detectors,
         measurements=cleared(measurements),
         nuclide=nuclide,

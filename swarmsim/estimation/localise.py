@@ -32,7 +32,6 @@ from swarmsim.estimation.search import (
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector
 from swarmsim.site import Site
-from swarmsim.site.horizon import ceilings
 
 POSITION_STEP_M = 10.0  # longest Fisher step of a coordinate
 ENOUGH_EFFECTIVE = 4.0  # weighted places must be worth this many: the mean is then within half a standard deviation
@@ -116,7 +115,6 @@ def localise(
     m, extra = jax.tree.map(lambda leaf: leaf[order], (m, extra))
     problem = FitProblem(
         site=site,
-        above=ceilings(site),
         detectors=detectors,
         measurements=m,
         nuclide=nuclide,

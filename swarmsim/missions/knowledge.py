@@ -23,7 +23,7 @@ from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
-from swarmsim.site import Site, path_lengths
+from swarmsim.site import Site, crossed
 from swarmsim.world.model import World
 
 
@@ -115,7 +115,7 @@ def accumulate_spectrum(
 
     def one(position: jax.Array, axis: jax.Array) -> jax.Array:
         def of_source(source: Source) -> jax.Array:
-            return spectrum_rate(detector, source, path_lengths(site, source.position_m, position), position, axis)
+            return spectrum_rate(detector, source, crossed(site, source.position_m, position), position, axis)
 
         return jnp.sum(jax.vmap(of_source)(sources), axis=0) + detector.background_spectrum
 

@@ -4,6 +4,7 @@ Nuclides, materials and detectors are files in ``configs``; the code names none 
 """
 
 from swarmsim.radiation.detector import KINDS, Detector, Source, build_detector, restrict
+from swarmsim.radiation.dose import build_dosimeter
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.library import Library, load_library
 from swarmsim.radiation.rate import draw_counts, exposure_of, line_rates, net_rate, observed_rate, spectrum_rate
@@ -15,6 +16,7 @@ __all__ = [
     "Library",
     "Source",
     "build_detector",
+    "build_dosimeter",
     "draw_counts",
     "exposure_of",
     "identify",

@@ -1,6 +1,9 @@
-"""Geometry of a cylindrical crystal seen from a point: silhouette, solid angle and effective area.
+"""Geometry of a cylindrical crystal seen from a point: effective area of parallel rays, and what is different close by.
 
-Directions are given by u = |cos| and s = sin of the angle between the crystal's axis and the line to the source.
+Directions are given by u = |cos| and s = sin of the angle between the crystal's axis and the line to the source. The
+counts per photon are A(u) / (4 pi (r^2 + S^2)) G(r, u): A the integral of the interaction probability over the
+silhouette for parallel rays, S half the crystal's diagonal, and G a tabulated ratio that is 1 far away and takes the
+solid angle and the chords of rays from a point into account.
 """
 
 import jax
@@ -10,49 +13,11 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 _RAYS = 96  # per axis of the grid over the silhouette
-
-
-def projected_area(radius_m: jax.Array, length_m: jax.Array, u: jax.Array, s: jax.Array) -> jax.Array:
-    """Silhouette [m2] of a cylinder: 2 a L s + pi a^2 u."""
-    return 2.0 * radius_m * length_m * s + jnp.pi * radius_m**2 * u
-
-
-def solid_angle_per_area(
-    radius_m: jax.Array, length_m: jax.Array, distance_m: jax.Array, u: jax.Array, s: jax.Array
-) -> jax.Array:
-    """Solid-angle fraction of the crystal over its silhouette [1/m2], at ``distance_m`` from the crystal's centre.
-
-    The end face and the side are each approximated by a disc of their area at its own angle (`_disc_fraction`). On the
-    axis that is the exact solid angle of the face at any distance, and one half in contact and inside the crystal. The
-    face is seen from the height h above it and the part of the offset that lies beyond its rim; the side is the
-    rectangle between its tangents, pi/8 of a radius in front of the axis (the mean position of the curved rims of a
-    side-on crystal), seen from its own height when near and from its middle when far. For a 2 inch crystal the error is
-    below 7 % from 6 cm on at any angle and below 3 % from 1 m on; far away it vanishes: silhouette / (4 pi r^2).
-    """
-    offset, height = distance_m * s, distance_m * u
-    above = jnp.maximum(height - 0.5 * length_m, 0.0)
-    beyond = offset * offset - radius_m * radius_m  # tangent length squared
-    outside = beyond > 1e-12
-    tangent2 = jnp.where(outside, beyond, 0.0)
-    tangent = jnp.where(outside, jnp.sqrt(jnp.where(outside, beyond, 1.0)), 0.0)
-    face_area = jnp.pi * radius_m**2
-    within = jnp.minimum(offset, radius_m) ** 2 * above**2 / (above**2 + radius_m**2)
-    face = _disc_fraction(face_area, above, tangent2 + within)
-    ahead = jnp.where(outside, tangent2 / (offset + jnp.pi / 8 * radius_m), 1.0)  # 1: gradients stay finite
-    side_area = 2.0 * radius_m * length_m * tangent / jnp.maximum(offset, 1e-9)
-    middle = (height**2 - above**2) * ahead**2 / (ahead**2 + 0.075 * length_m**2)
-    side = jnp.where(outside, _disc_fraction(side_area, ahead, above**2 + middle), 0.0)
-    return jnp.minimum(face + side, 0.5) / projected_area(radius_m, length_m, u, s)
-
-
-def _disc_fraction(area: jax.Array, height: jax.Array, offset2: jax.Array) -> jax.Array:
-    """Solid-angle fraction of a disc at a height along its normal and an offset (squared) across it.
-
-    On the axis (1 - h / S) / 2 with S^2 = h^2 + a^2, written a^2 / (2 S (S + h)), which does not cancel in float32.
-    """
-    distance = jnp.sqrt(height**2 + offset2 + 1e-20)
-    to_rim = jnp.sqrt(distance**2 + area / jnp.pi)
-    return 0.5 * area / jnp.pi / (to_rim * (to_rim + distance)) * (height + 1e-6) / (distance + 1e-6)
+_CONE_RAYS = 4096
+NEAR_STEP = 0.2  # of ln(1 + 2 r / S) between two rows of the table of G
+NEAR_ROWS = 34  # to r = 400 S
+NEAR_COLUMNS = 31  # every 3 degrees from the axis to the side
+NEAR_TABLES = 3  # attenuations for which G is tabulated; a line's own is linear between them
 
 
 def direction_basis(u: jax.Array, s: jax.Array) -> jax.Array:
@@ -60,11 +25,87 @@ def direction_basis(u: jax.Array, s: jax.Array) -> jax.Array:
     return jnp.stack([jnp.ones_like(u), u, s, u * s, u * u])
 
 
+def near_ratio(table: jax.Array, distance: jax.Array, u: jax.Array, s: jax.Array) -> jax.Array:
+    """G [NEAR_TABLES] at ``distance`` [] in units of S; bilinear in ``table`` (`Detector.near`)."""
+    row = jnp.clip(jnp.log1p(2.0 * distance) / NEAR_STEP, 0.0, NEAR_ROWS - 1.001)
+    column = jnp.clip(jnp.arctan2(s, u) * (2.0 / jnp.pi) * (NEAR_COLUMNS - 1), 0.0, NEAR_COLUMNS - 1.001)
+    i, j = row.astype(jnp.int32), column.astype(jnp.int32)
+    y, x = row - i, column - j
+    flat = table.reshape(NEAR_TABLES, -1)
+    place = i * NEAR_COLUMNS + j
+
+    def at(offset: int) -> jax.Array:
+        return flat.at[:, place + offset].get(mode="promise_in_bounds")
+
+    low = (1.0 - x) * at(0) + x * at(1)
+    high = (1.0 - x) * at(NEAR_COLUMNS) + x * at(NEAR_COLUMNS + 1)
+    return (1.0 - y) * low + y * high
+
+
+def half_diagonal(radius_m: float, length_m: float) -> float:
+    """S: radius [m] of the sphere around the crystal."""
+    return float(np.hypot(radius_m, 0.5 * length_m))
+
+
+def near_tables(radius_m: float, length_m: float, attenuation_1_m: Floats) -> Floats:
+    """G [k, NEAR_ROWS, NEAR_COLUMNS] for each attenuation [k]; host side."""
+    reach = half_diagonal(radius_m, length_m)
+    distances = 0.5 * np.expm1(NEAR_STEP * np.arange(NEAR_ROWS))
+    angles = np.linspace(0.0, 0.5 * np.pi, NEAR_COLUMNS)
+    seen = np.array([
+        [fraction_counted(radius_m, length_m, max(d, 1e-6) * reach, float(np.cos(a)), attenuation_1_m) for a in angles]
+        for d in distances
+    ])  # fmt: skip
+    # rays in the same pattern far away: what the pattern does to the integral cancels in the ratio
+    away = 1e4
+    far = [fraction_counted(radius_m, length_m, away * reach, float(np.cos(a)), attenuation_1_m) for a in angles]
+    ratio = seen * (distances**2 + 1.0)[:, None, None] / (np.array(far) * away**2)
+    ratio[-1] = 1.0
+    return np.moveaxis(ratio, -1, 0)
+
+
+def fraction_counted(radius_m: float, length_m: float, distance_m: float, u: float, attenuation_1_m: Floats) -> Floats:
+    """Share [k] of an isotropic point source's photons that interact in the crystal, for each attenuation [k].
+
+    The integral of 1 - exp(-mu chord) over the solid angle, with evenly spread rays in the cone around the crystal.
+    """
+    s, reach = np.sqrt(max(1.0 - u * u, 0.0)), half_diagonal(radius_m, length_m)
+    place = distance_m * np.array([s, 0.0, u])
+    lowest = np.sqrt(1.0 - (reach / distance_m) ** 2) if distance_m > reach else -1.0
+    # 1 - lowest cancels far away
+    cone = (reach / distance_m) ** 2 / (1.0 + lowest) if distance_m > reach else 2.0
+    number = np.arange(_CONE_RAYS)
+    share, azimuth = (number + 0.5) / _CONE_RAYS, 2.399963229728653 * number
+    drop = share * cone
+    across = np.sqrt(np.maximum(drop * (2.0 - drop), 0.0))
+    axis = np.array([-s, 0.0, -u])
+    side, up = np.array([-u, 0.0, s]), np.array([0.0, 1.0, 0.0])
+    ray = (1.0 - drop)[:, None] * axis
+    ray = ray + across[:, None] * (np.cos(azimuth)[:, None] * side + np.sin(azimuth)[:, None] * up)
+    chord = _chord(place, ray, radius_m, length_m)
+    return np.array([0.5 * cone * np.mean(-np.expm1(-mu * chord)) for mu in attenuation_1_m])
+
+
+def _chord(place: Floats, ray: Floats, radius: float, length: float) -> Floats:
+    """Length [n] of rays from ``place`` [3] along unit vectors [n, 3] inside the cylinder about the z axis."""
+    a = np.maximum(ray[:, 0] ** 2 + ray[:, 1] ** 2, 1e-18)
+    b = place[0] * ray[:, 0] + place[1] * ray[:, 1]
+    square = b * b - a * (place[0] ** 2 + place[1] ** 2 - radius**2)
+    root = np.sqrt(np.maximum(square, 0.0))
+    enter = np.where(square > 0.0, (-b - root) / a, np.inf)
+    leave = np.where(square > 0.0, (-b + root) / a, -np.inf)
+    along = np.where(np.abs(ray[:, 2]) < 1e-12, 1e-12, ray[:, 2])
+    ends = np.sort(np.stack([(-0.5 * length - place[2]) / along, (0.5 * length - place[2]) / along]), axis=0)
+    return np.maximum(np.minimum(leave, ends[1]) - np.maximum(np.maximum(enter, ends[0]), 0.0), 0.0)
+
+
 def absorbing_area(radius_m: float, length_m: float, u: float, attenuation_1_m: Floats) -> Floats:
     """Integral of the interaction probability over the silhouette [m2], for parallel rays and each attenuation [k].
 
     The probability is 1 - exp(-mu l) for a ray with chord l. Host side, with the midpoint rule.
     """
+    if u > 1.0 - 1e-12:
+        return np.asarray(np.pi * radius_m**2 * -np.expm1(-np.asarray(attenuation_1_m) * length_m))
     s = float(np.sqrt(max(1.0 - u * u, 0.0)))
     half = radius_m * u + 0.5 * length_m * s
     offsets = (np.arange(_RAYS) + 0.5) / _RAYS * 2.0 - 1.0
@@ -75,11 +116,7 @@ def absorbing_area(radius_m: float, length_m: float, u: float, attenuation_1_m: 
     along = (offsets * half)[:, None]
     half_chord = np.sqrt(np.maximum(radius_m**2 - across**2, 0.0))[None, :]
     origin_x, origin_z = along * u, -along * s
-    enter, leave = np.full(half_chord.shape, -np.inf), np.full(half_chord.shape, np.inf)
-    if s > 0:
-        enter, leave = (-half_chord - origin_x) / s, (half_chord - origin_x) / s
-    else:
-        leave = np.where(np.abs(origin_x) <= half_chord, leave, -np.inf)
+    enter, leave = (-half_chord - origin_x) / s, (half_chord - origin_x) / s
     if u > 0:
         enter = np.maximum(enter, (-0.5 * length_m - origin_z) / u)
         leave = np.minimum(leave, (0.5 * length_m - origin_z) / u)
@@ -100,7 +137,6 @@ def fit_effective_area(radius_m: float, length_m: float, attenuation_1_m: Floats
     weight = np.where((angles == angles[0]) | (angles == angles[-1]), 30.0, 1.0)
     grid = np.geomspace(min(attenuation_1_m) * 0.99, max(attenuation_1_m) * 1.01, 40)
     areas = np.stack([absorbing_area(radius_m, length_m, float(c), grid) for c in u])  # [angles, grid]
-    areas[0] = np.pi * radius_m**2 * -np.expm1(-grid * length_m)
     scale = weight[:, None] / areas
     systems = ((basis * w[:, None], a * w) for a, w in zip(areas.T, scale.T, strict=True))
     coefficients = np.stack([np.linalg.lstsq(left, right, rcond=None)[0] for left, right in systems])

@@ -1,6 +1,8 @@
 """Detectors and sources as arrays, and construction of a detector from its configuration (host side)."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -8,22 +10,23 @@ from numpy.typing import NDArray
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.radiation import Detector as DetectorSpec
-from swarmsim.config.radiation import DetectorMount, Material
+from swarmsim.config.radiation import DetectorMount
 from swarmsim.pytree import on_device, pytree, static
-from swarmsim.radiation.cylinder import fit_effective_area
-from swarmsim.radiation.library import Library, build_up_coefficients, linear_attenuation, mass_attenuation
-from swarmsim.radiation.response import (
-    Response,
-    background_spectrum,
-    build_response,
-    peak_spectrum,
-    scattered_spectrum,
-)
+from swarmsim.radiation import scattering
+from swarmsim.radiation.attenuation import linear_attenuation
+from swarmsim.radiation.cylinder import NEAR_TABLES, fit_effective_area, near_tables
+from swarmsim.radiation.library import Library
+from swarmsim.radiation.response import Response, background_spectrum, build_response, line_spectra, normalised
 
 Floats = NDArray[np.float64]
 
 KINDS = ("physical", "paper_ideal")
 AIR = "air"  # material of the part of a ray that lies in no obstacle
+OPAQUE_1_M = 1e6  # attenuation of a detector that counts every photon that meets it
+SPECTRUM_BINS = 28
+"""Bins of scattered photons, of equal width in ln(energy), in which spectra behind walls are put together."""
+SPECTRUM_DEPTHS = (1.0, 5.0)
+"""Mean free paths for which the energies of scattered photons are tabulated."""
 
 
 @pytree
@@ -37,7 +40,7 @@ class Source:
 
 @pytree
 class Detector:
-    """A cylindrical counter on a vehicle; tables for every nuclide (N) and line (L, padded with yield 0)."""
+    """A cylindrical counter on a vehicle; tables for every nuclide (N), line (L, padded with yield 0), material (M)."""
 
     radius_m: jax.Array  # [] of the crystal
     length_m: jax.Array  # []
@@ -48,18 +51,30 @@ class Detector:
     non_paralyzable_s: jax.Array  # []
     sample_period_s: jax.Array  # [] live time of one measurement
     yields: jax.Array  # [N, L] photons per decay
-    effective_area_m2: jax.Array  # [N, L, 5] coefficients of cylinder.direction_basis, housing and efficiency included
-    transport_1_m: jax.Array  # [N, 4, L, M] linear attenuation mu, and mu times build-up C, D, P of each material
-    shielding: jax.Array  # [N, 4, L] optical depth, and depth times C, D, P, of the shielded template of `identify`
+    effective_area_m2: jax.Array  # [N, L, 5] coefficients of cylinder.direction_basis, housing and threshold included
+    near: jax.Array  # [NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS] of cylinder.near_ratio
+    near_share: jax.Array  # [N, L, NEAR_TABLES] weights of the tables for each line
+    attenuation_1_m: jax.Array  # [N, L, M]
+    scatter_1_m: jax.Array  # [N, positions, COEFFICIENTS, L, M] attenuation times coefficients of scattered counts
     peak_spectrum: jax.Array  # [N, L, channels] share of the counts of unscattered photons in each channel, sums to 1
-    scattered_spectrum: jax.Array  # [N, L, channels] same for photons that scattered before the crystal
+    scattered_bins: jax.Array  # [N, depths, M, L, SPECTRUM_BINS] share of the scattered counts in each bin, sums to 1
+    bin_spectrum: jax.Array  # [SPECTRUM_BINS, channels] spectra of photons of those bins, each sums to 1
     background_spectrum: jax.Array  # [channels] cps, sums to background_cps
     energy_kev: jax.Array  # [channels] centre of each channel
     line_energy_kev: jax.Array  # [N, L]
     nuclide_names: tuple[str, ...] = static()
     material_names: tuple[str, ...] = static()
     kind: str = static()  # physical | paper_ideal
-    identification_bins: tuple[int, ...] = static()  # first channel of each bin that identification works in
+    identification_bins: tuple[int, ...] = static()  # first channel of each bin of identification; () without
+
+
+@dataclass(frozen=True)
+class _Counting:
+    """How a detector counts photons, whatever its kind."""
+
+    attenuation_1_m: Callable[[Floats], Floats]  # in the crystal
+    counts: Callable[[Floats], Floats]  # per photon that interacts there
+    through_housing: Callable[[Floats], Floats]
 
 
 def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, kind: str) -> Detector:
@@ -72,23 +87,18 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {KINDS}, not {kind!r}")
-    crystal, housing = library.material(spec.crystal), library.material(spec.housing.material)
-    air = library.material_index(AIR)
-    lines_max = max(len(n.lines) for n in library.nuclides)
-    energy, yields = np.full((len(library.nuclides), lines_max), 662.0), np.zeros((len(library.nuclides), lines_max))
-    for i, nuclide in enumerate(library.nuclides):
-        energy[i, : len(nuclide.lines)] = [line.energy_kev for line in nuclide.lines]
-        yields[i, : len(nuclide.lines)] = [line.yield_percent / 100 for line in nuclide.lines]
+    energy, yields = lines_of(library)
     radius, length = spec.diameter_mm / 2000, spec.length_mm / 1000
-    response = build_response(spec, crystal, housing)
-    if kind == "physical":
-        mu = linear_attenuation(crystal, energy)
-        area = fit_effective_area(radius, length, mu.ravel()).reshape(*mu.shape, 5)
-        area = area * (response.bare_factor(energy) * response.housing_transmission(energy))[..., None]
-    else:
-        silhouette = np.array([0.0, np.pi * radius**2, 2 * radius * length, 0.0, 0.0])
-        area = np.broadcast_to(silhouette, (*energy.shape, 5))
+    response = None
+    if spec.crystal is not None:
+        response = build_response(spec, library.material(spec.crystal), library.material(spec.housing.material))
+    counting = _counting(spec, library, response, kind)
+    mu = np.broadcast_to(counting.attenuation_1_m(energy), energy.shape)
+    area = fit_effective_area(radius, length, mu.ravel()).reshape(*energy.shape, 5)
+    area = area * (counting.counts(energy) * counting.through_housing(energy))[..., None]
+    nodes = np.geomspace(mu.min(), max(mu.max(), 1.01 * mu.min()), NEAR_TABLES)
     axis = np.asarray(mount.axis) / np.linalg.norm(mount.axis)
+    attenuation, coefficients, bins = _transport(library, energy, kind, counting, (radius, length))
     f32 = on_device
     return Detector(
         radius_m=f32(radius),
@@ -101,17 +111,16 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         sample_period_s=f32(spec.sample_period_s),
         yields=f32(yields),
         effective_area_m2=f32(area),
-        transport_1_m=f32(_transport(library, energy, kind, air)),
-        shielding=f32(_shielding(housing, energy, kind)),
-        peak_spectrum=f32(peak_spectrum(response, energy)),
-        scattered_spectrum=f32(scattered_spectrum(response, energy)),
-        background_spectrum=f32(background_spectrum(response, spec.background)),
-        energy_kev=f32(response.channel_centre_kev),
+        near=f32(near_tables(radius, length, nodes)),
+        near_share=f32(_shares(np.log(mu), np.log(nodes))),
+        attenuation_1_m=f32(attenuation),
+        scatter_1_m=f32(coefficients),
+        scattered_bins=f32(bins),
         line_energy_kev=f32(energy),
         nuclide_names=library.nuclide_names,
         material_names=library.material_names,
         kind=kind,
-        identification_bins=_identification_bins(response),
+        **_spectra(spec, response, energy),
     )
 
 
@@ -125,30 +134,124 @@ def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
         raise InputError.of(f"unknown nuclides {missing}", allowed="one of " + ", ".join(detector.nuclide_names))
     rows = np.array([detector.nuclide_names.index(name) for name in nuclides])
     lines = int(np.max(np.sum(np.asarray(detector.yields)[rows] > 0, axis=1)))
-    per_line = ("yields", "effective_area_m2", "peak_spectrum", "scattered_spectrum", "line_energy_kev")
+    per_line = ("yields", "effective_area_m2", "near_share", "attenuation_1_m", "peak_spectrum", "line_energy_kev")
     tables = {name: getattr(detector, name)[rows, :lines] for name in per_line}
-    transport = detector.transport_1_m[rows, :, :lines]
-    shielding = detector.shielding[rows, :, :lines]
-    return replace(detector, transport_1_m=transport, shielding=shielding, nuclide_names=nuclides, **tables)
+    tables |= {name: getattr(detector, name)[rows][..., :lines, :] for name in ("scatter_1_m", "scattered_bins")}
+    return replace(detector, nuclide_names=nuclides, **tables)
 
 
-def _transport(library: Library, energy: Floats, kind: str, air: int) -> Floats:
-    """Linear attenuation and build-up products [N, 4, L, M] in 1/m."""
-    table = np.zeros((energy.shape[0], 4, energy.shape[1], len(library.materials)))
-    for m, material in enumerate(library.materials):
-        mu = linear_attenuation(material, energy)
-        if kind == "physical":
-            table[..., m] = np.stack([mu, *(mu * k for k in build_up_coefficients(material, energy))], axis=1)
-        elif m != air:
-            table[:, 0, :, m] = mu
-    return table
+def lines_of(library: Library) -> tuple[Floats, Floats]:
+    """Energies [N, L] and photons per decay [N, L] of every nuclide's lines, padded with yield 0."""
+    lines_max = max(len(n.lines) for n in library.nuclides)
+    energy, yields = np.full((len(library.nuclides), lines_max), 662.0), np.zeros((len(library.nuclides), lines_max))
+    for i, nuclide in enumerate(library.nuclides):
+        energy[i, : len(nuclide.lines)] = [line.energy_kev for line in nuclide.lines]
+        yields[i, : len(nuclide.lines)] = [line.yield_percent / 100 for line in nuclide.lines]
+    return energy, yields
 
 
-def _shielding(material: Material, energy: Floats, kind: str) -> Floats:
-    """Optical depth, and depth times C, D, P [N, 4, L], of two mean free paths (at 662 keV) of ``material``."""
-    depth = 2.0 * mass_attenuation(material, energy) / mass_attenuation(material, 662.0)
-    build_up = [depth * k for k in build_up_coefficients(material, energy)]
-    return np.stack([depth, *build_up] if kind == "physical" else [depth, *np.zeros((3, *depth.shape))], axis=1)
+def _counting(spec: DetectorSpec, library: Library, response: Response | None, kind: str) -> _Counting:
+    if kind == "paper_ideal":
+        return _Counting(lambda e: np.full_like(e, OPAQUE_1_M), np.ones_like, np.ones_like)
+    if response is not None:
+        return _Counting(response.attenuation_1_m, response.counts, response.housing_transmission)
+    assert spec.efficiency is not None
+    points = np.log([p.energy_kev for p in spec.efficiency])
+    values = np.log([p.efficiency for p in spec.efficiency])
+    housing, thickness = library.material(spec.housing.material), spec.housing.thickness_mm / 1000
+    return _Counting(
+        lambda e: np.full_like(e, OPAQUE_1_M),
+        lambda e: np.exp(np.interp(np.log(e), points, values)),
+        lambda e: np.exp(-linear_attenuation(housing, e) * thickness),
+    )
+
+
+def _shares(value: Floats, nodes: Floats) -> Floats:
+    """Weights [..., k] of linear interpolation between ``nodes`` [k], constant beyond them."""
+    place = np.interp(value, nodes, np.arange(len(nodes), dtype=float))
+    return np.asarray(np.maximum(1.0 - np.abs(place[..., None] - np.arange(len(nodes))), 0.0))
+
+
+def _transport(
+    library: Library, energy: Floats, kind: str, counting: _Counting, size: tuple[float, float]
+) -> tuple[Floats, Floats, Floats]:
+    """The fields attenuation_1_m, scatter_1_m and scattered_bins of a detector."""
+    flat, back = np.unique(energy, return_inverse=True)
+    materials, k = library.materials, len(flat)
+    attenuation = np.zeros((k, len(materials)))
+    scatter = np.zeros((len(scattering.POSITIONS), scattering.COEFFICIENTS, k, len(materials)))
+    bins = np.zeros((len(SPECTRUM_DEPTHS), len(materials), k, SPECTRUM_BINS))
+    if kind == "physical":
+        energies = scattering.bin_energies(flat)
+        counted = _mean_area(counting, energies, size) / _mean_area(counting, flat, size)[:, None]
+    for m, material in enumerate(materials):
+        if kind == "paper_ideal":
+            attenuation[:, m] = 0.0 if material.name == AIR else linear_attenuation(material, flat)
+            continue
+        attenuation[:, m] = linear_attenuation(material, flat)
+        counts = scattering.scattered_photons(material, flat) * counted[:, None, None, :]
+        fits = scattering.fitted(counts.sum(axis=-1))  # [k, positions, COEFFICIENTS]
+        scatter[..., m] = np.moveaxis(fits, 0, -1) * attenuation[:, m]
+        bins[:, m] = _energy_shares(counts[:, :, 0], energies)
+    shape = energy.shape
+    by_nuclide = back.reshape(shape)
+    return (
+        attenuation[by_nuclide],
+        np.moveaxis(scatter[:, :, by_nuclide], 2, 0),
+        np.moveaxis(bins[:, :, by_nuclide], 2, 0),
+    )
+
+
+def _mean_area(counting: _Counting, energy: Floats, size: tuple[float, float]) -> Floats:
+    """Counts per photon and area [...] of photons that come from around, up to a factor.
+
+    End on, with the mean chord of the crystal (4 V / S, Cauchy) in place of its length.
+    """
+    radius, length = size
+    chord = 2.0 * radius * length / (radius + length)
+    seen = -np.expm1(-counting.attenuation_1_m(energy) * chord)
+    return np.asarray(seen * counting.counts(energy) * counting.through_housing(energy))
+
+
+def _energy_shares(counts: Floats, energies: Floats) -> Floats:
+    """Shares [depths, k, SPECTRUM_BINS] of the scattered counts [k, d, BINS] by energy, at `SPECTRUM_DEPTHS`."""
+    edges = spectrum_edges()
+    relative = np.log(energies / scattering.CUT_KEV)  # [k, BINS] middles
+    width = 2.0 * relative[:, :1]
+    low, high = relative - 0.5 * width, relative + 0.5 * width
+    log_edges = np.log(edges / scattering.CUT_KEV)
+    below = np.clip((log_edges - low[..., None]) / (high - low)[..., None], 0.0, 1.0)
+    part = np.diff(below, axis=-1)  # [k, BINS, SPECTRUM_BINS]
+    rows = [int(np.argmin(np.abs(scattering.depths() - depth))) for depth in SPECTRUM_DEPTHS]
+    shares = np.stack([np.einsum("kb,kbs->ks", counts[:, row], part) for row in rows])
+    return normalised(shares)
+
+
+def spectrum_edges() -> Floats:
+    """Edges [SPECTRUM_BINS + 1] in keV of the bins of scattered photons."""
+    return np.geomspace(scattering.CUT_KEV, 3000.0, SPECTRUM_BINS + 1)
+
+
+def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats) -> dict[str, Any]:
+    """The fields of a detector that have channels; a counter without energy resolution has one channel."""
+    f32 = on_device
+    if response is None:
+        return {
+            "peak_spectrum": f32(np.ones((*energy.shape, 1))),
+            "bin_spectrum": f32(np.ones((SPECTRUM_BINS, 1))),
+            "background_spectrum": f32(np.array([spec.background.rate_cps])),
+            "energy_kev": f32(np.array([662.0])),
+            "identification_bins": (),
+        }
+    flat, back = np.unique(energy, return_inverse=True)
+    edges = spectrum_edges()
+    return {
+        "peak_spectrum": f32(normalised(line_spectra(response, flat))[back].reshape(*energy.shape, -1)),
+        "bin_spectrum": f32(normalised(line_spectra(response, np.sqrt(edges[1:] * edges[:-1])))),
+        "background_spectrum": f32(background_spectrum(response, spec.background)),
+        "energy_kev": f32(response.channel_centre_kev),
+        "identification_bins": _identification_bins(response),
+    }
 
 
 def _identification_bins(response: Response) -> tuple[int, ...]:
@@ -157,6 +260,6 @@ def _identification_bins(response: Response) -> tuple[int, ...]:
     end = len(response.channel_centre_kev)
     while starts[-1] < end:
         energy = response.channel_edge_kev[starts[-1]]
-        width = response.sigma_kev(np.array([energy]))[0] * 2.355 / 3 / response.channel_width_kev
-        starts.append(min(starts[-1] + max(round(float(width)), 1), end))
+        fwhm = response.sigma_kev(np.asarray(energy)) * 2.354820045
+        starts.append(min(end, starts[-1] + max(1, round(float(fwhm) / 3 / response.channel_width_kev))))
     return tuple(starts)

@@ -19,7 +19,8 @@ from jax.scipy.special import ndtr
 from swarmsim.pytree import pytree
 from swarmsim.radiation.cylinder import direction_basis
 from swarmsim.radiation.detector import Detector
-from swarmsim.radiation.rate import transmission
+from swarmsim.radiation.rate import scattered_shares, transmission
+from swarmsim.site.rays import Crossed
 
 ITERATIONS = 150
 _RELAXATION = 1.6  # exponent of the multiplicative step; below 2 it still converges and needs fewer steps
@@ -28,6 +29,7 @@ _PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO = 0.4, 0.1, 0.4, 0.1
 _TEMPLATE_ERROR = 0.04  # relative error of the templates in a bin: an estimate
 _STRENGTH_SCALE = 0.3  # scale of the half-Cauchy prior of a source's strength, in units of the background
 _COUNTS_FLOOR = 0.05  # per bin: keeps the information finite where almost no counts are expected
+_SHIELD_M = 0.11  # of concrete: two mean free paths at 662 keV
 _SMOOTH = 3  # templates shared by the hypotheses: background and the two continua
 
 
@@ -68,12 +70,25 @@ def templates(detector: Detector) -> jax.Array:
     broad = jnp.exp(-detector.energy_kev / 350.0) * above
     end_on = direction_basis(jnp.float32(1.0), jnp.float32(0.0))
     lines = detector.yields * (detector.effective_area_m2 @ end_on)  # [N, L]
-    direct, scattered = transmission(detector.shielding)
+    way = _shielding(detector)
+
+    def behind(number: jax.Array, lines: jax.Array) -> jax.Array:
+        direct, scattered = transmission(detector, number, way)
+        bins = (lines * scattered) @ scattered_shares(detector, number, way)
+        return (lines * direct) @ detector.peak_spectrum[number] + bins @ detector.bin_spectrum
+
     bare = jnp.einsum("nl,nlc->nc", lines, detector.peak_spectrum)
-    shielded = jnp.einsum("nl,nlc->nc", lines * direct, detector.peak_spectrum)
-    shielded += jnp.einsum("nl,nlc->nc", lines * scattered, detector.scattered_spectrum)
+    shielded = jax.lax.map(lambda pair: behind(*pair), (jnp.arange(lines.shape[0]), lines))
     stacked = jnp.concatenate([jnp.stack([detector.background_spectrum, low, broad]), bare, shielded])
     return stacked / jnp.maximum(jnp.sum(stacked, axis=1, keepdims=True), 1e-30)
+
+
+def _shielding(detector: Detector) -> Crossed:
+    """`_SHIELD_M` of concrete half way between source and detector."""
+    names = detector.material_names
+    wall = names.index("concrete") if "concrete" in names else 0
+    length = jnp.zeros(len(names)).at[wall].set(_SHIELD_M)
+    return Crossed(length_m=length, place=jnp.full(len(names), 0.5))
 
 
 def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identification:

@@ -1,11 +1,8 @@
-"""The nuclides and materials of the configuration folders, and interpolation of their tables (host side)."""
+"""The nuclides and materials of the configuration folders (host side)."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.files import config_dirs
@@ -13,9 +10,6 @@ from swarmsim.config.load import load_all
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.radiation import Material, Nuclide
 
-Floats = NDArray[np.float64]
-ELECTRON_KEV = 510.99895  # rest energy, CODATA 2018
-BUILD_UP_SCALE = 0.2  # mean free paths, in B = 1 + C t (1 + t / 0.2)^P exp(D t)
 T = TypeVar("T", Nuclide, Material)
 
 
@@ -73,30 +67,3 @@ def load_library(near: Path | None = None) -> Library:
             places = ", ".join(map(str, config_dirs(near))) or "configs"
             raise InputError.of(f"no {kind} found: put {kind}/<name>.yaml into {places}")
     return Library(nuclides, materials)
-
-
-def mass_attenuation(material: Material, energy_kev: ArrayLike) -> Floats:
-    """Mass attenuation coefficient [cm2/g] at ``energy_kev`` [...], log-log between the table's points.
-
-    An energy that is listed twice is an absorption edge, and the step is kept. Raises `InputError` outside the table.
-    """
-    energy, table = np.asarray(energy_kev, np.float64), np.asarray(material.energy_kev)
-    if np.any(energy < table[0]) or np.any(energy > table[-1]):
-        raise InputError.of(
-            f"material '{material.name}' is tabulated from {table[0]:g} to {table[-1]:g} keV and is needed at "
-            f"{np.min(energy):g} to {np.max(energy):g} keV: extend energy_kev and mass_attenuation_cm2_g in its file"
-        )
-    return np.exp(np.interp(np.log(energy), np.log(table), np.log(material.mass_attenuation_cm2_g)))
-
-
-def linear_attenuation(material: Material, energy_kev: ArrayLike) -> Floats:
-    """Linear attenuation coefficient [1/m] at ``energy_kev`` [...] and the material's bulk density."""
-    return mass_attenuation(material, energy_kev) * 0.1 * material.density_kg_m3
-
-
-def build_up_coefficients(material: Material, energy_kev: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """C, D and P of the number build-up at ``energy_kev`` [...], linear in ln(energy), constant outside the table."""
-    log_energy = np.log(np.asarray(energy_kev, np.float64))
-    table = np.log([row.energy_kev for row in material.build_up])
-    c, d, p = (np.interp(log_energy, table, [getattr(row, k) for row in material.build_up]) for k in ("c", "d", "p"))
-    return c, d, p

@@ -1,62 +1,70 @@
 """Count rate of one detector from one point source, dead time, and drawn counts (device side).
 
-    rate = sum over lines of  A y A_eff(E, theta) Omega/(4 pi S) exp(-sum mu_k x_k) B(E)
+    rate = sum over lines of  A y A_eff(E, theta) G / (4 pi (r^2 + S^2)) (exp(-t) + scattered(t)),  t = sum mu_k x_k
 
-with activity A, silhouette S of the crystal, and effective area A_eff, the integral of the detection probability over
-the silhouette.
+with activity A, effective area A_eff (the integral of the detection probability over the silhouette), near-field ratio
+G (`swarmsim.radiation.cylinder`), and the scattered counts of `swarmsim.radiation.scattering`.
 """
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.radiation.cylinder import direction_basis, solid_angle_per_area
-from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.library import BUILD_UP_SCALE
+from swarmsim.radiation.cylinder import direction_basis, near_ratio
+from swarmsim.radiation.detector import SPECTRUM_DEPTHS, Detector, Source
 from swarmsim.radiation.poisson import poisson
+from swarmsim.radiation.scattering import DEPTH_MAX, DEPTH_SCALES, POSITIONS
+from swarmsim.site.rays import Crossed
 
 
 def line_rates(
-    detector: Detector, source: Source, lengths_m: jax.Array, position_m: jax.Array, axis: jax.Array
+    detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Counts per second [L] of each line from unscattered photons, and [L] from scattered ones.
 
-    ``lengths_m`` [M] is the path through each material, ``position_m`` [3] the crystal's centre and ``axis`` [3] its
-    unit axis, world ENU. The build-up of several layers with optical depths t_k is that of the depth sum(t_k), with
-    C, D and P averaged over the layers with weights t_k. For a single material that is its own build-up. The order of
-    the layers is not known from their lengths and has no effect. Scattered photons are counted with the efficiency and
-    the direction of their line.
+    ``way`` is what the line from the source to the crystal crosses, ``position_m`` [3] the crystal's centre and
+    ``axis`` [3] its unit axis, world ENU. Scattered counts behind several layers with optical depths t_k are those of
+    the depth sum(t_k), with coefficients averaged over the layers with weights t_k; each layer's lie between those of a
+    wall near the source and of one half way. Scattered photons come from the direction of the source.
     """
-    direct, scattered = transmission(detector.transport_1_m[source.nuclide] @ lengths_m)
+    direct, scattered = transmission(detector, source.nuclide, way)
     seen = _seen(detector, source, position_m, axis)
     return seen * direct, seen * scattered
 
 
-def transmission(optical: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Unscattered and scattered photons [..., L] behind matter, relative to the photons without it.
-
-    ``optical`` [..., 4, L] is the optical depth t and t C, t D, t P: t exp(-t) C (1 + t / 0.2)^P exp(D t) scattered.
-    """
-    depth, c, d, p = (optical[..., k, :] for k in range(4))
-    growth = d + p / (depth + 1e-9) * jnp.log1p(depth / BUILD_UP_SCALE)
-    return jnp.exp(-depth), c * jnp.exp(growth - depth)
+def transmission(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[jax.Array, jax.Array]:
+    """Unscattered and scattered counts [L] behind matter, relative to the counts without it."""
+    depth = detector.attenuation_1_m[nuclide] @ way.length_m
+    direct = jnp.exp(-depth)
+    if detector.kind == "paper_ideal":
+        return direct, jnp.zeros_like(direct)
+    first, last = POSITIONS
+    near = jnp.clip((last - way.place) / (last - first), 0.0, 1.0)
+    lengths = jnp.stack([near * way.length_m, (1.0 - near) * way.length_m])  # [positions, M]
+    c = jnp.einsum("pclm,pm->cl", detector.scatter_1_m[nuclide], lengths) / (depth + 1e-9)
+    t = jnp.minimum(depth, DEPTH_MAX)
+    growth = c[0] + c[1] * t + c[2] * jnp.log1p(t / DEPTH_SCALES[0]) + c[3] * jnp.log1p(t / DEPTH_SCALES[1])
+    return direct, depth * jnp.exp(growth - depth)
 
 
 def _seen(detector: Detector, source: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
     """Counts per second of each line [L] without attenuation."""
     offset = source.position_m - position_m
-    distance = jnp.sqrt(jnp.sum(offset * offset) + 1e-12)
+    squared = jnp.sum(offset * offset)
+    distance = jnp.sqrt(squared + 1e-12)
     u = jnp.abs(jnp.dot(offset, axis)) / distance
     across = jnp.cross(offset, axis) / distance
     s = jnp.sqrt(jnp.sum(across * across) + 1e-10)  # keeps the gradient finite on the axis
-    geometry = solid_angle_per_area(detector.radius_m, detector.length_m, distance, u, s)
+    reach2 = detector.radius_m**2 + 0.25 * detector.length_m**2
+    near = near_ratio(detector.near, distance / jnp.sqrt(reach2), u, s)
     area = detector.effective_area_m2[source.nuclide] @ direction_basis(u, s)
-    return (source.activity_bq * geometry) * detector.yields[source.nuclide] * area
+    geometry = (detector.near_share[source.nuclide] @ near) / (4.0 * jnp.pi * (squared + reach2))
+    return source.activity_bq * geometry * detector.yields[source.nuclide] * area
 
 
 def net_rate(
     detector: Detector,
     source: Source,
-    lengths_m: jax.Array,
+    way: Crossed,
     position_m: jax.Array,
     axis: jax.Array,
     *,
@@ -64,10 +72,10 @@ def net_rate(
 ) -> jax.Array:
     """Counts per second [] that ``source`` adds, before dead time; see `line_rates` for the arguments.
 
-    ``uncollided`` excludes photons that scattered before the crystal (build-up 1). Differentiable in the source's
-    position and activity, the crystal's position and the lengths.
+    ``uncollided`` excludes photons that scattered before the crystal. Differentiable in the source's position and
+    activity, the crystal's position and the lengths.
     """
-    direct, scattered = line_rates(detector, source, lengths_m, position_m, axis)
+    direct, scattered = line_rates(detector, source, way, position_m, axis)
     return jnp.sum(direct if uncollided else direct + scattered)
 
 
@@ -99,8 +107,23 @@ def draw_counts(
 
 
 def spectrum_rate(
-    detector: Detector, source: Source, lengths_m: jax.Array, position_m: jax.Array, axis: jax.Array
+    detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
 ) -> jax.Array:
     """Counts per second in each channel [channels] that ``source`` adds; they sum to `net_rate`."""
-    direct, scattered = line_rates(detector, source, lengths_m, position_m, axis)
-    return direct @ detector.peak_spectrum[source.nuclide] + scattered @ detector.scattered_spectrum[source.nuclide]
+    direct, scattered = line_rates(detector, source, way, position_m, axis)
+    shares = scattered_shares(detector, source.nuclide, way)
+    bins = jnp.einsum("l,lb->b", scattered, shares)
+    return direct @ detector.peak_spectrum[source.nuclide] + bins @ detector.bin_spectrum
+
+
+def scattered_shares(detector: Detector, nuclide: jax.Array, way: Crossed) -> jax.Array:
+    """Shares [L, bins] of the scattered counts by energy: means over the layers, between the tabulated depths."""
+    layers = detector.attenuation_1_m[nuclide] * way.length_m  # [L, M]
+    depth = jnp.sum(layers, axis=1)
+    first, last = SPECTRUM_DEPTHS
+    deep = jnp.clip((depth - first) / (last - first), 0.0, 1.0)
+    weight = jnp.where(depth[:, None] > 1e-6, layers / jnp.maximum(depth, 1e-6)[:, None], 1.0 / layers.shape[1])
+    table = detector.scattered_bins[nuclide]  # [depths, M, L, bins]
+    mean = jnp.einsum("lm,dmlb->dlb", weight, table)
+    shares = (1.0 - deep)[:, None] * mean[0] + deep[:, None] * mean[1]
+    return shares / jnp.maximum(jnp.sum(shares, axis=1, keepdims=True), 1e-12)

@@ -6,31 +6,29 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from swarmsim.config.errors import InputError
 from swarmsim.config.radiation import Background, Detector, Material
-from swarmsim.radiation.library import ELECTRON_KEV, linear_attenuation
+from swarmsim.radiation.attenuation import coefficients, linear_attenuation
+from swarmsim.radiation.crystal import ENERGIES_KEV, PulseHeights, compton_edge_kev, deposit_edges, pulse_heights
+from swarmsim.radiation.elements import CUT_KEV, ELECTRON_KEV
 
 Floats = NDArray[np.float64]
 
 REFERENCE_KEV = 661.66
 SIGMA_PER_FWHM = 1 / 2.354820045
 _STEP_KEV = 3.0  # grid of deposited energies, before the finite resolution is applied
-# Shares of the continuum below a full-energy peak, estimates for a crystal of 1.5 to 2 inches on a light vehicle:
-_BACKSCATTER_SHARE = 0.08  # photons backscattered by the surroundings of the crystal
-_MULTIPLE_SHARE = 0.12  # several Compton events in the crystal, between the edge and the peak
 
 
 @dataclass(frozen=True)
 class Response:
-    """A crystal's resolution, channels and efficiencies as functions of energy."""
+    """A scintillator's resolution, channels and pulse heights as functions of the photon's energy."""
 
     channel_edge_kev: Floats  # [channels + 1]
     threshold_kev: float
     fwhm_at_reference: float  # relative, at 661.66 keV
-    efficiency_kev: Floats  # [p]
-    efficiency_factor: Floats  # [p] tabulated total over the narrow-beam 1 - exp(-mu L)
-    peak_share: Floats  # [p] photopeak over total
+    backscatter_share: float  # of the continuum: photons that the surroundings of the crystal scatter back
+    pulses: PulseHeights
     crystal: Material
-    crystal_length_m: float
     housing: Material
     housing_thickness_m: float
 
@@ -46,66 +44,37 @@ class Response:
 
     def sigma_kev(self, energy_kev: Floats) -> Floats:
         """Standard deviation of the peak at an energy: FWHM = R sqrt(661.66 E)."""
-        return self.fwhm_at_reference * np.sqrt(REFERENCE_KEV * energy_kev) * SIGMA_PER_FWHM
+        return self.fwhm_at_reference * np.sqrt(REFERENCE_KEV * np.maximum(energy_kev, 1.0)) * SIGMA_PER_FWHM
 
-    def bare_factor(self, energy_kev: Floats) -> Floats:
-        """Tabulated end-on efficiency over 1 - exp(-mu L), linear in ln(energy): loss by escape below the threshold."""
-        return np.interp(np.log(energy_kev), np.log(self.efficiency_kev), self.efficiency_factor)
+    def attenuation_1_m(self, energy_kev: Floats) -> Floats:
+        """Attenuation by what leaves energy in the crystal: all but coherent scattering."""
+        parts = coefficients(self.crystal, energy_kev)
+        return (parts.total - parts.coherent) * 0.1 * self.crystal.density_kg_m3
 
     def housing_transmission(self, energy_kev: Floats) -> Floats:
         """Share of the photons that cross the housing unscattered."""
         return np.exp(-linear_attenuation(self.housing, energy_kev) * self.housing_thickness_m)
 
-    def end_on_efficiency(self, energy_kev: Floats) -> Floats:
-        """Counts per photon that meets the housing end-on."""
-        narrow = -np.expm1(-linear_attenuation(self.crystal, energy_kev) * self.crystal_length_m)
-        return narrow * self.bare_factor(energy_kev) * self.housing_transmission(energy_kev)
-
-    def photopeak_share(self, energy_kev: Floats) -> Floats:
-        """Share of the counts in the full-energy peak; log-log between the points and beyond the last, at most 1."""
-        x, points, values = np.log(energy_kev), np.log(self.efficiency_kev), np.log(self.peak_share)
-        slope = (values[-1] - values[-2]) / (points[-1] - points[-2])
-        beyond = values[-1] + slope * np.maximum(x - points[-1], 0.0)
-        return np.exp(np.minimum(np.where(x > points[-1], beyond, np.interp(x, points, values)), 0.0))
+    def counts(self, energy_kev: Floats) -> Floats:
+        """Counts above the threshold per photon that interacts [...], linear between 96 energies."""
+        grid = np.geomspace(CUT_KEV, ENERGIES_KEV[-1], 96)
+        return np.interp(np.log(energy_kev), np.log(grid), line_spectra(self, grid).sum(axis=1))
 
 
 def build_response(spec: Detector, crystal: Material, housing: Material) -> Response:
     """Response of the crystal that ``spec`` describes."""
-    points = np.array([p.energy_kev for p in spec.efficiency])
-    total = np.array([p.total for p in spec.efficiency])
-    narrow = -np.expm1(-linear_attenuation(crystal, points) * spec.length_mm / 1000)
+    assert spec.spectrometer is not None
     analyser = spec.spectrometer
     return Response(
         channel_edge_kev=np.linspace(0.0, analyser.energy_max_kev, analyser.channels + 1),
         threshold_kev=analyser.threshold_kev,
         fwhm_at_reference=analyser.resolution_percent_at_662_kev / 100,
-        efficiency_kev=points,
-        efficiency_factor=total / narrow,
-        peak_share=np.array([p.photopeak / p.total for p in spec.efficiency]),
+        backscatter_share=spec.backscatter_share,
+        pulses=pulse_heights(crystal, spec.diameter_mm / 2000, spec.length_mm / 1000),
         crystal=crystal,
-        crystal_length_m=spec.length_mm / 1000,
         housing=housing,
         housing_thickness_m=spec.housing.thickness_mm / 1000,
     )
-
-
-def compton_edge_kev(energy_kev: Floats) -> Floats:
-    """Largest energy deposited by one Compton event: E 2k / (1 + 2k), k = E / 511 keV."""
-    k = energy_kev / ELECTRON_KEV
-    return energy_kev * 2 * k / (1 + 2 * k)
-
-
-def compton_recoil(energy_kev: float, recoil_kev: Floats) -> Floats:
-    """Klein-Nishina distribution of the recoil energy [t], unnormalised; 0 beyond the Compton edge.
-
-    The Klein-Nishina formula (Knoll, Radiation Detection and Measurement, 4th ed., section 2.III) in terms of
-    s = T / E instead of the angle.
-    """
-    k = energy_kev / ELECTRON_KEV
-    inside = (recoil_kev > 0) & (recoil_kev < compton_edge_kev(np.array(energy_kev)))
-    s = np.where(inside, recoil_kev, 0.0) / energy_kev
-    shape = 2.0 + s**2 / (k * (1.0 - s)) ** 2 + s / (1.0 - s) * (s - 2.0 / k)
-    return np.where(inside, shape, 0.0)
 
 
 def _blur(response: Response, grid_kev: Floats) -> Floats:
@@ -114,71 +83,63 @@ def _blur(response: Response, grid_kev: Floats) -> Floats:
     return np.diff(ndtr(edges), axis=1) * (response.channel_centre_kev >= response.threshold_kev)
 
 
-def _grid(response: Response) -> Floats:
-    return np.arange(0.5 * _STEP_KEV, response.channel_edge_kev[-1] * 1.1, _STEP_KEV)
+def line_spectra(response: Response, energy_kev: Floats) -> Floats:
+    """Spectra [k, channels] of the lines ``energy_kev`` [k]: counts per photon that interacts in the crystal.
 
-
-def _continuum(response: Response, energy_kev: float, grid: Floats) -> Floats:
-    """Distribution of deposited energies below the full-energy peak [grid]; sums to 1.
-
-    It consists of single Compton events, multiple ones, and backscatter.
+    Peaks are at their place; the continuum is that of the Monte Carlo's neighbouring energies in its own scale, below
+    the Compton edge and above it.
     """
-    edge = float(compton_edge_kev(np.array(energy_kev)))
-    above = grid >= response.threshold_kev
-    single = compton_recoil(energy_kev, grid) * above
-    multiple = ((grid > edge) & (grid < energy_kev)) * above
-    back = energy_kev - edge
-    backscatter = np.exp(-0.5 * ((grid - 1.05 * back) / (0.08 * back)) ** 2) * (grid < energy_kev) * above
-    single_share = 1 - _MULTIPLE_SHARE - _BACKSCATTER_SHARE
-    parts = ((single, single_share), (multiple, _MULTIPLE_SHARE), (backscatter, _BACKSCATTER_SHARE))
-    total = sum(share * shape / max(float(shape.sum()), 1e-12) for shape, share in parts)
-    return np.asarray(total / max(float(np.sum(total)), 1e-12))
+    energy = np.asarray(energy_kev, np.float64)
+    if np.any(energy > ENERGIES_KEV[-1]):
+        raise InputError.of(
+            f"a line of {energy.max():g} keV lies beyond crystals' response ({ENERGIES_KEV[-1]:g} keV): leave it out"
+        )
+    pulses, log_grid = response.pulses, np.log(ENERGIES_KEV)
+
+    def at(values: Floats) -> Floats:
+        return np.interp(np.log(energy), log_grid, values)
+
+    grid_edge = np.arange(0.0, max(response.channel_edge_kev[-1] * 1.1, energy.max() + 30.0), _STEP_KEV)
+    continua = np.stack([at(column) for column in pulses.continuum.T], axis=1)
+    bare = np.stack([_rebinned(e, c, grid_edge) for e, c in zip(energy, continua, strict=True)])
+    below_peak = bare.sum(axis=1, keepdims=True)
+    middle = 0.5 * (grid_edge[1:] + grid_edge[:-1])
+    back = np.stack([_backscatter(float(e), middle) for e in energy])
+    share = response.backscatter_share
+    spectra = ((1.0 - share) * bare + share * below_peak * back) @ _blur(response, middle)
+    for part, lost in (
+        (pulses.full, 0.0), (pulses.x_ray, pulses.x_ray_kev), (pulses.single, ELECTRON_KEV),
+        (pulses.double, 2 * ELECTRON_KEV),
+    ):  # fmt: skip
+        left = energy - lost
+        spectra = spectra + (at(part) * (left > 1.0))[:, None] * _blur(response, np.maximum(left, 1.0))
+    return np.asarray(at(pulses.deposits)[:, None] * spectra)
 
 
-def _normalised(spectra: Floats) -> Floats:
-    return np.asarray(spectra / spectra.sum(axis=-1, keepdims=True))
+def _rebinned(energy: float, continuum: Floats, grid_edge: Floats) -> Floats:
+    """Shares of the continuum in the cells of the grid."""
+    sums = np.concatenate([[0.0], np.cumsum(continuum)])
+    return np.diff(np.interp(grid_edge, deposit_edges(energy), sums))
 
 
-def peak_spectrum(response: Response, energy_kev: Floats) -> Floats:
-    """Spectra [..., channels] of unscattered photons of the lines ``energy_kev`` [...]; each sums to 1."""
-    grid = _grid(response)
-    flat, back = np.unique(energy_kev, return_inverse=True)
-    share = response.photopeak_share(flat)[:, None]
-    continuum = np.stack([_continuum(response, float(e), grid) for e in flat]) @ _blur(response, grid)
-    spectra = _normalised(share * _blur(response, flat) + (1 - share) * continuum)
-    return spectra[back].reshape(*energy_kev.shape, -1)
+def _backscatter(energy: float, grid: Floats) -> Floats:
+    """Photons scattered back by the surroundings [grid], a hump near the energy after 180 degrees; sums to 1."""
+    back = energy - float(compton_edge_kev(np.asarray(energy)))
+    hump = np.exp(-0.5 * ((grid - 1.05 * back) / (0.08 * back)) ** 2) * (grid < energy)
+    return np.asarray(hump / max(float(hump.sum()), 1e-12))
 
 
-def scattered_flux(energy_kev: float, grid: Floats) -> Floats:
-    """Photons per keV [grid] that scattered between source and detector, unnormalised.
-
-    A compromise between the Monte Carlo spectra of air and of concrete at 1 to 2 mean free paths
-    (``configs/materials/generate_build_up.py``): flat in ln(E) up to the line, with a maximum at 105 keV and a fall
-    below 50 keV, where photons are absorbed.
-    """
-    hump = 0.22 + 0.28 * np.exp(-0.5 * (np.log(grid / 105.0) / 0.5) ** 2)
-    return np.where(grid < energy_kev, hump * -np.expm1(-((grid / 50.0) ** 3)) / grid, 0.0)
-
-
-def scattered_spectrum(response: Response, energy_kev: Floats) -> Floats:
-    """Spectra [..., channels] of the scattered photons of the lines ``energy_kev`` [...]; each sums to 1."""
-    grid = _grid(response)
-    inside = np.flatnonzero((grid >= response.threshold_kev) & (grid <= response.crystal.energy_kev[-1]))[::2]
-    photons = grid[inside]
-    share = response.photopeak_share(photons)
-    deposits = (1 - share)[:, None] * np.stack([_continuum(response, float(e), grid) for e in photons])
-    deposits[np.arange(len(inside)), inside] += share
-    flat, back = np.unique(energy_kev, return_inverse=True)
-    flux = np.stack([scattered_flux(float(e), photons) for e in flat]) * response.end_on_efficiency(photons)
-    return _normalised(flux @ deposits @ _blur(response, grid))[back].reshape(*energy_kev.shape, -1)
+def normalised(spectra: Floats) -> Floats:
+    """Spectra [..., channels] that sum to 1."""
+    return np.asarray(spectra / np.maximum(spectra.sum(axis=-1, keepdims=True), 1e-30))
 
 
 def background_spectrum(response: Response, background: Background) -> Floats:
     """Background [channels] in cps: the lines with their continua, on exp(-E / continuum_kev) above the threshold."""
     centre = response.channel_centre_kev
-    continuum = _normalised(np.exp(-centre / background.continuum_kev) * (centre >= response.threshold_kev))
+    continuum = normalised(np.exp(-centre / background.continuum_kev) * (centre >= response.threshold_kev))
     spectrum = (1 - sum(line.share for line in background.lines)) * continuum
     if background.lines:
-        lines = peak_spectrum(response, np.array([line.energy_kev for line in background.lines]))
+        lines = normalised(line_spectra(response, np.array([line.energy_kev for line in background.lines])))
         spectrum = spectrum + np.array([line.share for line in background.lines]) @ lines
     return background.rate_cps * spectrum

@@ -12,7 +12,7 @@ from swarmsim.physics.rotations import rotate
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import draw_counts, exposure_of, net_rate, observed_rate
-from swarmsim.site import Site, path_lengths
+from swarmsim.site import Site, crossed
 from swarmsim.vehicles.state import RigidState
 
 
@@ -89,8 +89,8 @@ def source_rate(site: Site, detector: Detector, sources: Source, position_m: jax
     """Net count rate [] that all sources (leading axis S) cause in a crystal at a place [3] with an axis [3]."""
 
     def one(source: Source) -> jax.Array:
-        lengths = path_lengths(site, source.position_m, position_m)
-        return net_rate(detector, source, lengths, position_m, axis)
+        way = crossed(site, source.position_m, position_m)
+        return net_rate(detector, source, way, position_m, axis)
 
     return jnp.sum(jax.vmap(one)(sources))
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from swarmsim.config.site import SiteSpec
 from swarmsim.pytree import pytree, static
+from swarmsim.site.terrain_crossing import Ceilings
 
 
 @pytree
@@ -50,6 +51,7 @@ class Site:
     survey_area_m: jax.Array  # [V, 2] ENU convex polygon, counter-clockwise
     ground_material: jax.Array  # [] int32 index into material_names
     steps: Steps | None = None  # None: the ground has no steps
+    above: Ceilings | None = None  # of the terrain; None: made where it is needed
     material_names: tuple[str, ...] = static()  # order of the materials table
 
 

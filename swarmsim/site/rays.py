@@ -1,43 +1,92 @@
-"""Path length through each material along a line segment."""
+"""What a straight line crosses: the length in each material, and where along the line it lies."""
+
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.site.model import Obstacles, Site, sample
+from swarmsim.pytree import pytree
+from swarmsim.site.model import Obstacles, Site
+from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
-GROUND_SAMPLES = 48  # points along a segment at which its height is compared with the terrain's
+BLOCK = 384  # segments intersected with all boxes at a time, so that the result fits the cache
+VECTOR = 8  # boxes are padded to a multiple of this SIMD width, with empty boxes
 _PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is parallel to the slab
 
 
-def path_lengths(site: Site, a: jax.Array, b: jax.Array, soil: jax.Array | None = None) -> jax.Array:
+@pytree
+class Crossed:
+    """Materials along a segment, in the order of ``Site.material_names``."""
+
+    length_m: jax.Array  # [..., M]
+    place: jax.Array  # [..., M] mean place of the material along the segment, 0 at its start and 1 at its end
+
+
+def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
     """Metres [M] of the straight segment from ``a`` [3] to ``b`` [3] (ENU, m) in each of ``site.material_names``.
 
-    Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
-    The length below the terrain is integrated with linear interpolation between `GROUND_SAMPLES` points, so that it is
-    continuous in both ends and differentiable almost everywhere. Where obstacles overlap, the lengths are scaled so
-    that their sum does not exceed the distance. The remaining distance is that through ``air`` if the table has it, and
-    then the sum equals the distance. ``soil`` [] is the fraction below the terrain (`ground_fraction`) if it is known.
+    See `crossed`.
     """
+    return crossed(site, a, b).length_m
+
+
+def crossed(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
+    """The materials on the straight segment from ``a`` [3] to ``b`` [3] (ENU, m).
+
+    Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
+    The terrain is crossed exactly too (`swarmsim.site.terrain_crossing`). Lengths are continuous in both ends and
+    differentiable almost everywhere; places are taken as constant by derivatives. Where obstacles overlap, the lengths
+    are scaled so that their sum does not exceed the distance. The remaining distance is that through ``air`` if the
+    table has it, and then the sum equals the distance.
+    """
+    return _crossed(site, above_of(site), a, b)
+
+
+def above_of(site: Site) -> Ceilings:
+    """The site's `Ceilings`, made here for a site that has none."""
+    return ceilings(site.terrain_m) if site.above is None else site.above
+
+
+def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array) -> Crossed:
     direction = b - a
     squared = jnp.sum(direction * direction)
     distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
     one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
     # Matrix product: a masked sum would dominate the cost.
-    boxes = _box_fractions(site.obstacles, a, direction)
-    fractions = jnp.dot(boxes, one_hot, precision=jax.lax.Precision.HIGHEST)
-    soil = ground_fraction(site, a, direction) if soil is None else soil
-    fractions = fractions + jnp.where(materials == site.ground_material, soil, 0.0)
+    share, moment = _box_fractions(site.obstacles, a, direction)
+    stacked = jnp.stack([share, jax.lax.stop_gradient(moment)])
+    fractions, moments = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
+    soil, soil_place = share_below(site, above, a, b)
+    ground = materials == site.ground_material
+    fractions = fractions + jnp.where(ground, soil, 0.0)
+    moments = moments + jnp.where(ground, jax.lax.stop_gradient(soil * soil_place), 0.0)
+    place = jnp.where(fractions > 1e-9, moments / jnp.maximum(fractions, 1e-9), 0.5)
     total = jnp.sum(fractions)
     fractions = fractions / jnp.maximum(total, 1.0)
     if "air" in site.material_names:
         rest = jnp.maximum(1.0 - total, 0.0)
         fractions = fractions + jnp.where(materials == site.material_names.index("air"), rest, 0.0)
-    return distance * fractions
+    return Crossed(length_m=distance * fractions, place=jax.lax.stop_gradient(jnp.clip(place, 0.0, 1.0)))
 
 
-def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> jax.Array:
-    """Fraction [K] of the segment inside the material of each box.
+def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
+    """`crossed` [n] of the segments from ``a`` [3] to each of ``b`` [n, 3], in blocks that fit the cache.
+
+    Segments that take about as many steps over the terrain cost least side by side: sort them by their height.
+    """
+    n, above = b.shape[0], above_of(site)
+    rows = -site.obstacles.wall_m.shape[0] % VECTOR
+    boxes = jax.tree.map(lambda x: jnp.pad(x, [(0, rows)] + [(0, 0)] * (x.ndim - 1)), site.obstacles)
+    padded = replace(site, obstacles=boxes)
+    size = min(BLOCK, n)
+    ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
+    found = jax.lax.map(jax.vmap(lambda end: _crossed(padded, above, a, end)), ends)
+    return jax.tree.map(lambda x: x.reshape(-1, x.shape[-1])[:n], found)
+
+
+def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Fraction [K] of the segment inside the material of each box, and the integral [K] of the place over it.
 
     Written per component, so that the boxes are the vectorised axis.
     """
@@ -56,25 +105,18 @@ def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> 
     outer = [obstacles.half_extent_m[:, k] for k in range(3)]
     inner = [half - obstacles.wall_m for half in outer]
     hollow = (obstacles.wall_m > 0.0) & (jnp.minimum(jnp.minimum(inner[0], inner[1]), inner[2]) > 0.0)
-    empty = jnp.where(hollow, _slab_fraction(middle, reach, inner), 0.0)
-    return _slab_fraction(middle, reach, outer) - empty
+    whole, of_whole = _slab_fraction(middle, reach, outer)
+    empty, of_empty = _slab_fraction(middle, reach, inner)
+    return whole - jnp.where(hollow, empty, 0.0), of_whole - jnp.where(hollow, of_empty, 0.0)
 
 
-def _slab_fraction(middle: list[jax.Array], reach: list[jax.Array], half: list[jax.Array]) -> jax.Array:
-    """Fraction [K] of the segments 0 <= t <= 1 inside boxes with slabs at middle -/+ reach half."""
+def _slab_fraction(
+    middle: list[jax.Array], reach: list[jax.Array], half: list[jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    """Fraction [K] of the segments 0 <= t <= 1 inside boxes with slabs at middle -/+ reach half, and its moment [K]."""
     enter = [m - r * h for m, r, h in zip(middle, reach, half, strict=True)]
     leave = [m + r * h for m, r, h in zip(middle, reach, half, strict=True)]
     first = jnp.maximum(jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2]), 0.0)
     last = jnp.minimum(jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2]), 1.0)
-    return jnp.maximum(last - first, 0.0)
-
-
-def ground_fraction(site: Site, a: jax.Array, direction: jax.Array) -> jax.Array:
-    """Fraction [] of the segment from ``a`` [3] along ``direction`` [3] (its whole length, m) below the terrain."""
-    points = a + jnp.linspace(0.0, 1.0, GROUND_SAMPLES)[:, None] * direction
-    depth = sample(site.terrain_m, site, points[:, :2]) - points[:, 2]
-    below = jnp.maximum(depth, 0.0)
-    # The depth is linear between two samples: the share below is g+ / (g+ + g-), all, or none.
-    span = jnp.abs(depth[:-1]) + jnp.abs(depth[1:])
-    part = jnp.where(span > 0.0, (below[:-1] + below[1:]) / jnp.where(span > 0.0, span, 1.0), 0.0)
-    return jnp.sum(part) / (GROUND_SAMPLES - 1)
+    share = jnp.maximum(last - first, 0.0)
+    return share, share * 0.5 * (jnp.minimum(first, 1.0) + jnp.maximum(last, 0.0))

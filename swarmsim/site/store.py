@@ -26,6 +26,7 @@ from swarmsim.config.site import SiteSpec
 from swarmsim.pytree import on_device
 from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh
 from swarmsim.site.source_files import MAX_FILE_MB, check_file
+from swarmsim.site.terrain_crossing import ceilings
 
 Arrays = dict[str, np.ndarray]
 
@@ -166,6 +167,7 @@ def _model(spec: SiteSpec, arrays: Arrays, material_names: Sequence[str]) -> Sit
         obstacles=obstacles,
         survey_area_m=on_device(arrays["survey_area"]),
         steps=_steps(arrays),
+        above=ceilings(arrays["terrain"]),
         ground_material=on_device(names.index(spec.ground_material), np.int32),
         material_names=tuple(names),
     )

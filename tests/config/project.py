@@ -11,9 +11,6 @@ name: nai_2x2
 crystal: sodium_iodide
 diameter_mm: 51.0
 length_mm: 51.0
-efficiency:
-  - {energy_kev: 100.0, total: 0.99, photopeak: 0.95}
-  - {energy_kev: 1500.0, total: 0.55, photopeak: 0.12}
 housing: {material: aluminium, thickness_mm: 0.8}
 background: {rate_cps: 94.0, continuum_kev: 300.0}
 dead_time: {model: non_paralyzable, non_paralyzable_us: 5.0}

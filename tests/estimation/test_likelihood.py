@@ -16,8 +16,7 @@ from swarmsim.estimation.likelihood import (
     travel_gain,
 )
 from swarmsim.radiation import Source, net_rate
-from swarmsim.site import path_lengths
-from swarmsim.site.horizon import ceilings
+from swarmsim.site import crossed
 from tests.estimation.survey import NUCLIDE, detector, draw, mean_rates, orbit, place, survey
 
 _information = jax.jit(fisher_information)
@@ -49,8 +48,8 @@ def test_net_rates_are_those_of_the_radiation_model_for_every_detector():
     rates = jax.jit(net_rates)(site, detectors, m, SOURCE, NUCLIDE)
     source = Source(position_m=SOURCE, activity_bq=jnp.ones(()), nuclide=NUCLIDE)
     for i in range(m.counts.shape[0]):
-        lengths = path_lengths(site, SOURCE, m.position_m[i])
-        expected = net_rate(detectors[int(m.detector[i])], source, lengths, m.position_m[i], m.axis[i])
+        way = crossed(site, SOURCE, m.position_m[i])
+        expected = net_rate(detectors[int(m.detector[i])], source, way, m.position_m[i], m.axis[i])
         np.testing.assert_allclose(rates[i], expected, rtol=1e-5)
 
 
@@ -85,7 +84,6 @@ def test_score_has_zero_mean_and_the_information_as_covariance():
     def score(key):
         problem = FitProblem(
             site=site,
-            above=ceilings(site),
             detectors=d,
             measurements=draw(m, rates, key),
             nuclide=NUCLIDE,

@@ -10,7 +10,6 @@ import pytest
 from swarmsim.estimation.likelihood import FitProblem, evaluate, scaled_inverse
 from swarmsim.estimation.posterior import sample_posterior
 from swarmsim.estimation.search import background_only, best_at, bounds
-from swarmsim.site.horizon import ceilings
 from tests.estimation.survey import NUCLIDE, detector, draw, mean_rates, place, survey
 
 SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
@@ -24,7 +23,7 @@ def problem_of(boxes, seed):
     m = draw(flight, mean_rates(site, d, flight, [(SOURCE, ACTIVITY)]), seed)
     m = jax.tree.map(lambda leaf: leaf[jnp.argsort(m.position_m[:, 2])], m)
     return FitProblem(
-        site=site, above=ceilings(site), detectors=d, measurements=m, nuclide=NUCLIDE, extra_cps=jnp.zeros(231),
+        site=site, detectors=d, measurements=m, nuclide=NUCLIDE, extra_cps=jnp.zeros(231),
         height_m=jnp.float32(1.0), height_std_m=jnp.float32(1e-3), rays=1,
     )  # fmt: skip
 

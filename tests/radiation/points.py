@@ -1,10 +1,10 @@
 """Sources, paths and a mount for the radiation tests."""
 
-import jax
 import jax.numpy as jnp
 
 from swarmsim.config.radiation import DetectorMount
 from swarmsim.radiation import Detector, Source
+from swarmsim.site import Crossed
 
 MOUNT = DetectorMount(model="any", position_m=(0.0, 0.0, -0.1), axis=(0.0, 0.0, 2.0))
 
@@ -18,9 +18,9 @@ def point(detector: Detector, nuclide: str, activity_bq: float = 170e6, position
     )
 
 
-def through(detector: Detector, **metres: float) -> jax.Array:
-    """Path lengths [M] by material name."""
+def through(detector: Detector, place: float = 0.5, **metres: float) -> Crossed:
+    """A way through so many metres of each named material, at ``place`` between source and detector."""
     lengths = jnp.zeros(len(detector.material_names))
     for name, length in metres.items():
         lengths = lengths.at[detector.material_names.index(name)].set(length)
-    return lengths
+    return Crossed(length_m=lengths, place=jnp.full(len(detector.material_names), place))
