@@ -91,8 +91,8 @@ def test_a_line_beyond_a_table_is_an_error(library: Library) -> None:
 def test_new_files_are_found_without_code(library: Library, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in ("nuclides", "materials"):
         (tmp_path / "configs" / kind).mkdir(parents=True)
-    (tmp_path / "configs/nuclides/Zn-65.yaml").write_text(
-        "name: Zn-65\nhalf_life_s: 2.109e7\nsource: test\nlines: [{energy_kev: 1115.5, yield_percent: 50.2}]\n"
+    (tmp_path / "configs/nuclides/Y-88.yaml").write_text(
+        "name: Y-88\nhalf_life_s: 9.215e6\nsource: test\nlines: [{energy_kev: 898.0, yield_percent: 93.9}]\n"
     )
     (tmp_path / "configs/materials/sand.yaml").write_text(
         "name: sand\ndensity_kg_m3: 1600\nsource: test\nenergy_kev: [30, 3000]\nmass_attenuation_cm2_g: [0.9, 0.036]\n"
@@ -100,10 +100,10 @@ def test_new_files_are_found_without_code(library: Library, tmp_path: Path, monk
     )
     monkeypatch.chdir(tmp_path)
     extended = load_library()
-    assert set(extended.nuclide_names) - set(library.nuclide_names) == {"Zn-65"}
+    assert set(extended.nuclide_names) - set(library.nuclide_names) == {"Y-88"}
     assert set(extended.material_names) - set(library.material_names) == {"sand"}
     detector = build_detector(load_named("detectors", "nai_2x2"), MOUNT, extended, "physical")
-    assert "Zn-65" in detector.nuclide_names
+    assert "Y-88" in detector.nuclide_names
     assert "sand" in detector.material_names
 
 
