@@ -49,6 +49,27 @@ def available(kind: str, near: Path | None = None) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
+def exists(path: Path) -> bool:
+    """Whether ``path`` exists; not where no file could have that name (too long, a character that is not allowed)."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def is_file(path: Path) -> bool:
+    """Whether ``path`` is a regular file; not where no file could have that name."""
+    return exists(path) and path.is_file()
+
+
+def listing(folder: Path, pattern: str) -> list[Path]:
+    """What matches ``pattern`` in a folder; nothing where there is no such folder or it cannot be read."""
+    try:
+        return list(folder.glob(pattern))
+    except (OSError, ValueError):
+        return []
+
+
 def looks_like_path(name: str) -> bool:
     """Whether ``name`` is meant as a path (it has a folder or a YAML suffix) rather than as a configuration's name."""
     return "/" in name or "\\" in name or Path(name).suffix in _SUFFIXES
@@ -61,14 +82,14 @@ def find(kind: str, name: str | Path, near: Path | None = None) -> Path:
     """
     path = Path(name)
     if isinstance(name, Path) or looks_like_path(name):
-        if kind == "sites" and (path / "site.yaml").is_file():
+        if kind == "sites" and is_file(path / "site.yaml"):
             return path / "site.yaml"
-        if path.exists():
+        if exists(path):
             return path
     known = available(kind, near)
     if str(name) in known:
         return known[str(name)]
-    beside = sorted(str(path.with_name(p.name)) for p in path.parent.glob("*") if p.suffix in _SUFFIXES)
+    beside = sorted(str(path.parent / p.name) for p in listing(path.parent, "*") if p.suffix in _SUFFIXES)
     raise InputError.of(
         f"there is no {'file' if looks_like_path(str(name)) else kind.removesuffix('s')} '{name}'",
         given=str(name),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from swarmsim.config.allowed import item
 from swarmsim.config.documents import Document, Place, dotted
 from swarmsim.config.errors import InputError, Problem
-from swarmsim.config.mission import Trigger
+from swarmsim.config.mission import PHASES_MAX, Trigger
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.policies import LandOn, PolicySettings
 from swarmsim.config.validation import validate
@@ -32,7 +32,7 @@ def read_settings(document: Document, near: Path | None) -> tuple[list[PolicySet
     phases = item(document.data, "phases")
     settings: list[PolicySettings | None] = []
     problems: list[Problem] = []
-    for i, phase in enumerate(phases if isinstance(phases, list) else ()):
+    for i, phase in enumerate(phases[:PHASES_MAX] if isinstance(phases, list) else ()):
         try:
             settings.append(_settings_of(document, i, phase, near))
         except InputError as error:
