@@ -1,18 +1,23 @@
 """Nuclides, materials and detectors as a user writes them."""
 
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec3
+from swarmsim.config.base import Fraction, Model, Name, PhotonEnergy, Vec3
+
+TABLE_MAX = 1000  # rows of a table
+Attenuation = Annotated[float, Field(ge=1e-6, le=1e6)]  # cm2/g
+CrystalSize = Annotated[float, Field(ge=0.1, le=2000)]  # mm
+DeadTimeUs = Annotated[float, Field(ge=0, le=1e6)]
 
 
 class Line(Model):
     """One gamma or X-ray line: photon energy and photons per hundred decays."""
 
     energy_kev: float = Field(ge=30, lt=10_000)
-    yield_percent: float = Field(gt=0, le=400)
+    yield_percent: float = Field(ge=1e-9, le=400)
 
 
 class Nuclide(Model):
@@ -22,7 +27,7 @@ class Nuclide(Model):
     """
 
     name: Name
-    half_life_s: Positive
+    half_life_s: float = Field(ge=1e-3, le=1e30)
     lines: tuple[Line, ...] = Field(min_length=1, max_length=64)
     source: str
 
@@ -33,8 +38,8 @@ class BuildUp(Model):
     B = 1 + C t (1 + t / 0.2)^P exp(D t): Berger's form with one factor more; leave P out for Berger's own.
     """
 
-    energy_kev: Positive
-    c: NonNegative
+    energy_kev: PhotonEnergy
+    c: float = Field(ge=0, le=1000)
     d: float = Field(gt=-1, lt=0.9)
     p: float = Field(default=0.0, gt=-3, lt=3)
 
@@ -47,13 +52,13 @@ class Material(Model):
     """
 
     name: Name
-    density_kg_m3: Positive
-    energy_kev: tuple[Positive, ...] = Field(min_length=2)
-    mass_attenuation_cm2_g: tuple[Positive, ...] = Field(min_length=2)
-    build_up: tuple[BuildUp, ...] = Field(min_length=1)
+    density_kg_m3: float = Field(ge=1e-3, le=30_000)
+    energy_kev: tuple[PhotonEnergy, ...] = Field(min_length=2, max_length=TABLE_MAX)
+    mass_attenuation_cm2_g: tuple[Attenuation, ...] = Field(min_length=2, max_length=TABLE_MAX)
+    build_up: tuple[BuildUp, ...] = Field(min_length=1, max_length=TABLE_MAX)
     source: str
-    mass_energy_absorption_cm2_g: tuple[Positive, ...] | None = None
-    electrons_mol_g: float | None = Field(default=None, gt=0, le=1)
+    mass_energy_absorption_cm2_g: tuple[Attenuation, ...] | None = Field(default=None, max_length=TABLE_MAX)
+    electrons_mol_g: float | None = Field(default=None, ge=0.01, le=1)
 
     @model_validator(mode="after")
     def _aligned(self) -> "Material":
@@ -75,8 +80,8 @@ class DeadTime(Model):
     """Dead-time law applied to everything the crystal sees, background included."""
 
     model: Literal["none", "paralyzable", "non_paralyzable", "hybrid"] = "none"
-    paralyzable_us: NonNegative = 0.0
-    non_paralyzable_us: NonNegative = 0.0
+    paralyzable_us: DeadTimeUs = 0.0
+    non_paralyzable_us: DeadTimeUs = 0.0
 
     @model_validator(mode="after")
     def _consistent(self) -> "DeadTime":
@@ -90,9 +95,9 @@ class DeadTime(Model):
 class EfficiencyPoint(Model):
     """Parallel-beam end-on efficiency of the bare crystal at one energy, all pulses > 30 keV and full-energy ones."""
 
-    energy_kev: Positive
-    total: float = Field(gt=0, le=1)
-    photopeak: float = Field(gt=0, le=1)
+    energy_kev: PhotonEnergy
+    total: float = Field(ge=1e-6, le=1)
+    photopeak: float = Field(ge=1e-9, le=1)
 
     @model_validator(mode="after")
     def _peak_within_total(self) -> "EfficiencyPoint":
@@ -105,22 +110,22 @@ class Housing(Model):
     """What a photon crosses before the crystal."""
 
     material: Name
-    thickness_mm: NonNegative
+    thickness_mm: float = Field(ge=0, le=1000)
 
 
 class BackgroundLine(Model):
     """One natural gamma line and its share of the background counts."""
 
-    energy_kev: Positive
+    energy_kev: PhotonEnergy
     share: Fraction
 
 
 class Background(Model):
     """Natural background: counts per second, and its spectrum (lines on a continuum exp(-E / continuum_kev))."""
 
-    rate_cps: NonNegative
-    continuum_kev: Positive
-    lines: tuple[BackgroundLine, ...] = ()
+    rate_cps: float = Field(ge=0, le=1e7)
+    continuum_kev: PhotonEnergy
+    lines: tuple[BackgroundLine, ...] = Field(default=(), max_length=64)
 
     @model_validator(mode="after")
     def _shares(self) -> "Background":
@@ -133,9 +138,9 @@ class Spectrometer(Model):
     """Multichannel analyser of a detector."""
 
     channels: int = Field(ge=64, le=16_384)
-    energy_max_kev: Positive
-    threshold_kev: Positive
-    resolution_percent_at_662_kev: float = Field(gt=0, le=50)
+    energy_max_kev: float = Field(ge=100, le=100_000)
+    threshold_kev: PhotonEnergy
+    resolution_percent_at_662_kev: float = Field(ge=0.01, le=50)
 
     @model_validator(mode="after")
     def _threshold_below_end(self) -> "Spectrometer":
@@ -149,13 +154,13 @@ class Detector(Model):
 
     name: Name
     crystal: Name
-    diameter_mm: Positive
-    length_mm: Positive
-    efficiency: tuple[EfficiencyPoint, ...] = Field(min_length=2)
+    diameter_mm: CrystalSize
+    length_mm: CrystalSize
+    efficiency: tuple[EfficiencyPoint, ...] = Field(min_length=2, max_length=TABLE_MAX)
     housing: Housing
     background: Background
     dead_time: DeadTime
-    sample_period_s: Positive
+    sample_period_s: float = Field(ge=1e-3, le=3600)
     spectrometer: Spectrometer
     sources: dict[str, str]
 
@@ -175,6 +180,6 @@ class DetectorMount(Model):
 
     @model_validator(mode="after")
     def _axis_has_a_direction(self) -> "DetectorMount":
-        if not any(self.axis):
+        if max(map(abs, self.axis)) < 1e-6:
             raise ValueError("axis must not be (0, 0, 0)")
         return self

@@ -122,6 +122,8 @@ def _message(details: ErrorDetails) -> str:
         return "is not a finite number"
     if kind == "string_pattern_mismatch":
         return "is not a valid name"
+    if kind == "string_too_long":
+        return "is too long"
     if kind == "string_too_short":
         return "is empty"
     if kind == "int_from_float":
