@@ -19,7 +19,7 @@ from swarmsim.config.errors import InputError, Problem
 Place = tuple[str | int, ...]
 
 SIZE_MAX_BYTES = 1_000_000
-VALUES_MAX = 40_000  # twice a team of 2000 vehicles; keeps the time for reading below a second
+VALUES_MAX = 40_000  # names of fields included; twice a team of 2000 vehicles, read in half a second
 DEPTH_MAX = 32
 FIELD_NAME_MAX = 200
 DIGITS_MAX = 18  # of a whole number: fits 64 bits
@@ -86,7 +86,7 @@ class _Loader(yaml.SafeLoader):
         """As in the base class; raises `_LimitError` before a large document takes its time."""
         self._count += 1
         self._depth += 1
-        if self._count > 2 * VALUES_MAX or self._depth > DEPTH_MAX:  # the keys of mappings are nodes too
+        if self._count > VALUES_MAX or self._depth > DEPTH_MAX:
             what = _TOO_DEEP if self._depth > DEPTH_MAX else _TOO_MANY
             raise _LimitError(*what, self.peek_event().start_mark.line + 1)
         try:
