@@ -1,7 +1,10 @@
 """A run on disk: ``runs/<name>/`` is complete or absent, whatever happens while it is written."""
 
+import errno
 import json
 import math
+import os
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -25,6 +28,8 @@ from swarmsim.results.summary import Timings, all_keys, batch_row, batch_summary
 from swarmsim.site.model import SiteModel
 
 _FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x y z, body (forward left up) to world"
+_FULL_BYTES = 2_000_000  # less is free where Rerun could not write its next chunk
+_NO_ROOM = os.strerror(errno.ENOSPC)
 
 
 class Built(Protocol):
@@ -96,6 +101,13 @@ def _parts(simulation: Built, records: Sequence[MissionRecord], timings: Timings
         if first.map is not None:
             _write_map(first.map, folder / names.MAP)
 
+    def write_mission(folder: Path) -> None:
+        try:
+            write_recording(first, site, folder / names.RECORDING)
+        except RuntimeError as error:  # Rerun's thread tells why on the standard error stream only
+            full = shutil.disk_usage(folder).free < _FULL_BYTES
+            raise OSError(errno.ENOSPC if full else errno.EIO, _NO_ROOM if full else f"recording: {error}") from error
+
     def write_figures(folder: Path) -> None:
         figures.write(first, site, folder / names.FIGURES)
 
@@ -110,7 +122,7 @@ def _parts(simulation: Built, records: Sequence[MissionRecord], timings: Timings
         write_scenario,
         write_tables,
         write_map,
-        lambda folder: write_recording(first, site, folder / names.RECORDING),
+        write_mission,
         write_figures,
         write_summary,
     ]

@@ -128,3 +128,17 @@ def test_a_batch_is_kept_too(kept: Path, record: MissionRecord, site: SiteModel,
         write_run(built(site), batch, tmp_path / "disk" / "batch", keep=True)
     (folder,) = kept.iterdir()
     assert {path.name for path in folder.iterdir()} == ALL | {"missions.parquet"}
+
+
+def test_a_recording_that_rerun_cannot_write_is_told(
+    kept: Path, record: MissionRecord, site: SiteModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_recording(record: MissionRecord, site: SiteModel, path: Path) -> None:
+        raise RuntimeError("File-writer thread shut down prematurely")  # what Rerun raises on a full disk
+
+    monkeypatch.setattr(run_directory, "write_recording", write_recording)
+    for free, told in ((1000, "No space left on device"), (10**9, "File-writer thread")):
+        usage = shutil.disk_usage(tmp_path)._replace(free=free)
+        monkeypatch.setattr(run_directory.shutil, "disk_usage", lambda _, usage=usage: usage)
+        with pytest.raises(InputError, match=told):
+            write_run(built(site), [record], tmp_path / "run")
