@@ -3,6 +3,7 @@
 Before the file is touched, an audit hook refuses everything but reading the robot's folder and Python's own modules.
 """
 
+import errno
 import json
 import os
 import sys
@@ -31,14 +32,14 @@ def _guard(folder: str, scratch: str) -> None:
             writes = bool((arguments[2] or 0) & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC))
             module = path.endswith((".py", ".pyc", ".so", ".pyd")) and within(path, modules)
             if not (within(path, mine) or (not writes and (within(path, readable) or module))):
-                raise PermissionError(f"it may not open {path}, which lies outside the robot's folder {folder}")
+                raise PermissionError(errno.EACCES, f"outside the robot's folder {folder}", path)
             if not os.path.isfile(path) and os.path.exists(path):
-                raise PermissionError(f"it may not open {path}, which is not a regular file")
+                raise PermissionError(errno.EACCES, "not a regular file", path)
         elif event in ("os.remove", "os.rename", "os.mkdir", "os.rmdir", "os.chmod", "os.truncate"):
             if not within(os.path.realpath(os.fsdecode(arguments[0])), mine):
-                raise PermissionError(f"it may not change {arguments[0]}")
+                raise PermissionError(errno.EACCES, "may not be changed", arguments[0])
         elif event.startswith(_REFUSED) and event not in _ALLOWED:
-            raise PermissionError(f"it may not use {event}")
+            raise PermissionError(errno.EACCES, f"may not use {event}")
 
     sys.addaudithook(hook)
 
