@@ -223,6 +223,11 @@ def _line(node: yaml.Node) -> int:
     return int(node.start_mark.line) + 1
 
 
+def _is_unicode(text: str) -> bool:
+    """Whether all of ``text`` are characters; YAML's escapes can write halves of surrogate pairs."""
+    return not any("\ud800" <= c <= "\udfff" for c in text) if not text.isascii() else True
+
+
 class _Builder:
     """Turns nodes into plain data, gathering marks and problems on the way."""
 
@@ -256,6 +261,8 @@ class _Builder:
             line = _line(key_node)
             if not isinstance(key_node, yaml.ScalarNode) or key_node.tag == _TAG + "null":
                 self._problem(key_node, place, "a field's name must be a word")
+            elif not _is_unicode(key):
+                self._problem(key_node, place, "holds a field's name with half of a pair of surrogates")
             elif len(key) > FIELD_NAME_MAX:
                 self._problem(key_node, place, f"a field's name has at most {FIELD_NAME_MAX} characters")
             elif key in first:
@@ -269,8 +276,11 @@ class _Builder:
     def _scalar(self, node: yaml.Node, place: Place) -> Any:
         text: str = node.value
         match node.tag.removeprefix(_TAG):
-            case "str":
+            case "str" if _is_unicode(text):
                 return text
+            case "str":
+                self._problem(node, place, "holds half of a pair of surrogates, which is no character")
+                return None
             case "null":
                 return None
             case "bool" if text.lower() in ("true", "false"):

@@ -1,5 +1,6 @@
 """Where configuration files are: the working folder's ``configs`` first, then those that the package carries."""
 
+import os
 from pathlib import Path
 
 from swarmsim.config.errors import InputError
@@ -26,11 +27,11 @@ def config_dirs(near: Path | None = None) -> list[Path]:
     if near is not None:
         parents = near.absolute().parents
         found += [parents[i + 1] for i in range(min(2, len(parents) - 1)) if parents[i].name in KINDS]
-        found = [folder for folder in found if folder.resolve() != packaged_dir()]
+        found = [folder for folder in found if resolved(folder) != packaged_dir()]
     found += [folder for folder in (Path.cwd() / "configs", packaged_dir()) if folder.is_dir()]
     unique: dict[Path, Path] = {}
     for folder in found:
-        unique.setdefault(folder.resolve(), folder)
+        unique.setdefault(resolved(folder), folder)
     return list(unique.values())
 
 
@@ -47,6 +48,11 @@ def available(kind: str, near: Path | None = None) -> dict[str, Path]:
         for name, path in named:
             found.setdefault(name, path)
     return dict(sorted(found.items()))
+
+
+def resolved(path: Path) -> Path:
+    """``path`` absolute and without links; as far as it goes where links lead in a circle."""
+    return Path(os.path.realpath(path))
 
 
 def exists(path: Path) -> bool:

@@ -50,7 +50,7 @@ def _with_body(vehicle: Any, path: Path, document: Document) -> Any:
     """The vehicle with its body's file, written relative to the folder of the vehicle's file, made absolute."""
     if vehicle.body is None:
         return vehicle
-    file = path.parent.resolve() / vehicle.body.file
+    file = files.resolved(path.parent) / vehicle.body.file
     if not files.is_file(file):
         place = ("body", "file")
         raise InputError([document.problem(place, "there is no such file", given=vehicle.body.file)])
@@ -88,12 +88,12 @@ def _extended(path: Path, kind: str | None, chain: tuple[Path, ...]) -> Document
     if not isinstance(parent, str):
         allowed = f"the name of one of the {kind}, or the path of a file"
         raise InputError([document.problem(place, "is not a name", given=str(parent), allowed=allowed)])
-    chain = (*chain, path.resolve())
+    chain = (*chain, files.resolved(path))
     if len(chain) > EXTENDS_MAX:
         allowed = f"at most {EXTENDS_MAX} files that extend each other"
         raise InputError([document.problem(place, "is the end of too long a chain", given=parent, allowed=allowed)])
     parent_path = _parent_path(document, kind, parent, path)
-    if parent_path.resolve() in chain:
+    if files.resolved(parent_path) in chain:
         loop = " -> ".join(p.stem for p in (*chain, parent_path))
         raise InputError([document.problem(place, f"extends itself: {loop}", given=parent)])
     base = _extended(parent_path, kind, chain)
@@ -112,7 +112,7 @@ def _parent_path(document: Document, kind: str, parent: str, path: Path) -> Path
         if files.is_file(beside):
             return beside
     known = files.available(kind, path)
-    own = {name: p for name, p in known.items() if p.resolve() != path.resolve()}
+    own = {name: p for name, p in known.items() if files.resolved(p) != files.resolved(path)}
     if parent in own:
         return own[parent]
     if parent in known or parent == path.stem:
