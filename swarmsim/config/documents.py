@@ -19,7 +19,7 @@ from swarmsim.config.errors import InputError, Problem
 Place = tuple[str | int, ...]
 
 SIZE_MAX_BYTES = 1_000_000
-VALUES_MAX = 40_000  # names of fields included; twice a team of 2000 vehicles, read in half a second
+VALUES_MAX = 30_000  # names of fields included; more than a team of 2000 vehicles, read in half a second
 DEPTH_MAX = 32
 FIELD_NAME_MAX = 200
 DIGITS_MAX = 18  # of a whole number: fits 64 bits
