@@ -26,7 +26,7 @@ sources: [{nuclide: Co-60, position_m: [-190, 60], height_m: 0.5, activity_mbq: 
 vehicles: [{name: uav, type: tarot_t650, position_m: [-190, 0]}]
 phases: [{name: climb, who: uav, policy: "climb.py:Climb", settings: {height_m: 12}, time_limit_s: 120}]
 """
-CONFIGURATIONS = {"nuclides": "Zn-65", "detectors": "nai_1x1", "vehicles": "heavy_t650"}
+CONFIGURATIONS = {"nuclides": "Y-88", "detectors": "nai_1x1", "vehicles": "heavy_t650"}
 
 
 def test_the_python_example_flies_and_steps(capsys, tmp_path, monkeypatch):

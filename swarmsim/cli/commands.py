@@ -281,6 +281,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     atexit.register(gc.freeze)  # the interpreter's last collection of garbage would take another second
     try:
+        os.getcwd()
+    except OSError as error:
+        sys.stderr.write(f"the working folder cannot be used ({error.strerror}): change to another one\n")
+        return EXIT_INPUT
+    try:
         app(
             sys.argv[1:] if arguments is None else list(arguments),
             exit_on_error=False,

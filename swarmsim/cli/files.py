@@ -81,7 +81,7 @@ def kind_of_file(path: Path) -> str:
 
 
 def _yaml_files(path: Path) -> Iterator[Path]:
-    if not path.is_dir():
+    if not (files.exists(path) and path.is_dir()):
         yield files.find("missions", path)
         return
     found = sorted(file for suffix in ("*.yaml", "*.yml") for file in path.rglob(suffix))

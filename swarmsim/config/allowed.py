@@ -126,7 +126,8 @@ def _bounds(schema: Schema) -> str:
 
 
 def _number(bound: float) -> str:
-    return str(int(bound)) if float(bound).is_integer() else f"{bound:g}"
+    whole = isinstance(bound, int) or (bound.is_integer() and abs(bound) < 1e7)
+    return str(int(bound)) if whole else f"{bound:g}"
 
 
 def item(value: Any, step: str | int) -> Any:

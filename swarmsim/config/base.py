@@ -13,13 +13,33 @@ class Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
 
 
-Name = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+
+# Every number has a lower and an upper bound. They lie far beyond what robots, sites and sources have, and well within
+# what single precision, the memory of a computer and a day of simulation can take.
+Positive = Annotated[float, Field(gt=0, le=1e9)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
-PositiveVec3 = tuple[Positive, Positive, Positive]
+Length = Annotated[float, Field(ge=1e-4, le=1e4)]  # m
+Part = Annotated[float, Field(ge=1e-4, le=100)]  # m, of a vehicle
+Gap = Annotated[float, Field(ge=0, le=1000)]  # m, such as a clearance
+Duration = Annotated[float, Field(ge=1e-3, le=86_400)]  # s
+Delay = Annotated[float, Field(ge=0, le=86_400)]  # s
+Lag = Annotated[float, Field(ge=1e-4, le=10)]  # s, time constant of a first-order lag
+Mass = Annotated[float, Field(ge=1e-4, le=1e5)]  # kg
+Speed = Annotated[float, Field(ge=1e-3, le=300)]  # m/s
+Acceleration = Annotated[float, Field(ge=1e-3, le=1000)]  # m/s2
+RotationSpeed = Annotated[float, Field(ge=1e-3, le=1e5)]  # rad/s
+Stiffness = Annotated[float, Field(ge=0.1, le=1e9)]  # N/m
+Damping = Annotated[float, Field(ge=0, le=1e7)]  # N s/m
+Friction = Annotated[float, Field(ge=0, le=10)]
+Gain = Annotated[float, Field(ge=1e-3, le=1000)]  # of a controller, SI
+Power = Annotated[float, Field(ge=0, le=1e6)]  # W
+PhotonEnergy = Annotated[float, Field(ge=1, le=1e6)]  # keV
+Coordinate = Annotated[float, Field(ge=-1e5, le=1e5)]  # m, ENU from the site's origin
+BodyCoordinate = Annotated[float, Field(ge=-100, le=100)]  # m, in a vehicle's frame
+Vec2 = tuple[Coordinate, Coordinate]
+Vec3 = tuple[BodyCoordinate, BodyCoordinate, BodyCoordinate]
 
 
 def _convex_counter_clockwise(points: tuple[Vec2, ...]) -> tuple[Vec2, ...]:

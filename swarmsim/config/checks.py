@@ -12,7 +12,7 @@ import numpy as np
 from swarmsim.config import files
 from swarmsim.config.allowed import item
 from swarmsim.config.documents import Document, Place
-from swarmsim.config.errors import Problem
+from swarmsim.config.errors import PROBLEMS_MAX, Problem, first_problems
 from swarmsim.config.mission import TEAM_MAX, Mission
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.phases import check_phases
@@ -22,6 +22,8 @@ from swarmsim.config.vehicles import Multirotor, SkidSteer
 
 if TYPE_CHECKING:
     from swarmsim.config.scenario import Scenario
+
+PAIRS_MAX = 50_000  # of vehicles that start too near to each other: sorting all pairs of a large team takes seconds
 
 
 def check_references(document: Document, near: Path | None) -> list[Problem]:
@@ -38,6 +40,8 @@ def check_references(document: Document, near: Path | None) -> list[Problem]:
         for step in place:
             value = item(value, step)
         if isinstance(value, str) and value not in (known := list(known)):
+            if len(problems) > PROBLEMS_MAX:
+                return
             allowed, hint = one_of(known), did_you_mean(value, known)
             problems.append(document.problem(place, f"there is no {what} '{value}'", allowed=allowed, suggestion=hint))
 
@@ -89,15 +93,16 @@ def check_detectors(
 
 def check_consistency(scenario: Scenario) -> list[Problem]:
     """Everything that the parts of a scenario get wrong together, in the order of the mission's file."""
-    return [
-        *_check_definitions(scenario),
-        *_check_timing(scenario),
-        *_check_materials(scenario),
-        *_check_names(scenario),
-        *_check_pads(scenario),
-        *_check_estimates(scenario),
-        *check_phases(scenario),
-    ]
+    checks = (
+        _check_definitions,
+        _check_timing,
+        _check_materials,
+        _check_names,
+        _check_pads,
+        _check_estimates,
+        check_phases,
+    )
+    return first_problems(problem for check in checks for problem in check(scenario))
 
 
 def footprint_radius_m(vehicle: Multirotor | SkidSteer) -> float:
@@ -201,7 +206,7 @@ def _check_pads(scenario: Scenario) -> Iterator[Problem]:
     pairs = KDTree(xy).query_pairs(2 * radius.max() + gap, output_type="ndarray")
     apart = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1)
     needed = radius[pairs].sum(axis=1) + gap
-    near = np.flatnonzero(apart < needed - 1e-9)
+    near = np.flatnonzero(apart < needed - 1e-9)[:PAIRS_MAX]
     near = near[np.lexsort((pairs[near, 0], pairs[near, 1]))]
     entries = np.array(scenario.entries)[pairs[near]]
     _, first = np.unique(entries, axis=0, return_index=True)

@@ -5,8 +5,10 @@ is a number, ``010`` is ten and ``1:30`` is a word, so that no number changes be
 """
 
 import re
+import stat
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,8 +18,11 @@ from swarmsim.config.errors import InputError, Problem
 
 Place = tuple[str | int, ...]
 
-SIZE_MAX_BYTES = 4_000_000
-VALUES_MAX = 200_000
+SIZE_MAX_BYTES = 1_000_000
+VALUES_MAX = 30_000  # names of fields included; more than a team of 2000 vehicles, read in half a second
+DEPTH_MAX = 32
+FIELD_NAME_MAX = 200
+DIGITS_MAX = 18  # of a whole number: fits 64 bits
 _TAG = "tag:yaml.org,2002:"
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
@@ -69,9 +74,33 @@ def dotted(place: Place) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes nodes with the scalars of the YAML 1.2 core schema."""
+    """Composes nodes with the scalars of the YAML 1.2 core schema, up to `VALUES_MAX` of them and `DEPTH_MAX` deep."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+
+    def __init__(self, stream: str):
+        super().__init__(stream)
+        self._count = self._depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """As in the base class; raises `_LimitError` before a large document takes its time."""
+        self._count += 1
+        self._depth += 1
+        if self._count > VALUES_MAX or self._depth > DEPTH_MAX:
+            what = _TOO_DEEP if self._depth > DEPTH_MAX else _TOO_MANY
+            raise _LimitError(*what, self.peek_event().start_mark.line + 1)
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+
+class _LimitError(Exception):
+    """A document exceeds a limit: the message, what is allowed, and the line."""
+
+
+_TOO_MANY = ("holds too many values", f"at most {VALUES_MAX}")
+_TOO_DEEP = ("is nested too deeply", f"at most {DEPTH_MAX} levels of fields and lists")
 
 
 class _Dumper(yaml.SafeDumper):
@@ -90,21 +119,32 @@ def dump_yaml(data: Any) -> str:
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=118, default_flow_style=None)
 
 
+def beginning(value: Any, items: int = 50, characters: int = 200) -> Any:
+    """The first ``items`` of ``value`` and of what is in it, and ``characters`` of each text: quick to write out."""
+    if isinstance(value, dict):
+        return {key: beginning(inner, items, characters) for key, inner in islice(value.items(), items)}
+    if isinstance(value, list):
+        return [beginning(inner, items, characters) for inner in value[:items]]
+    return value[:characters] if isinstance(value, str) else value
+
+
 def read_file(path: Path) -> Document:
     """The mapping that a YAML file holds. Raises `InputError` when it cannot be read as one."""
     shown = shown_path(path)
     if path.is_dir():
         raise InputError.of("is a folder, not a file", file=shown, suggestion="name the YAML file in it")
+    allowed = f"a YAML file of at most {SIZE_MAX_BYTES / 1e6:g} MB"
     try:
-        size = path.stat().st_size
-        if size > SIZE_MAX_BYTES:
-            allowed = f"a YAML file of at most {SIZE_MAX_BYTES / 1e6:g} MB"
-            raise InputError.of(
-                "is too large for a configuration file", file=shown, given=f"{size / 1e6:.1f} MB", allowed=allowed
-            )
-        raw = path.read_bytes()
-    except OSError as error:
-        raise InputError.of(f"cannot be read: {error.strerror or error}", file=shown) from error
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):  # reading a pipe or a device may never end
+            raise InputError.of("is not a regular file (a pipe, a device or a socket)", file=shown, allowed=allowed)
+        with path.open("rb") as stream:
+            raw = stream.read(SIZE_MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        raise InputError.of(f"cannot be read: {getattr(error, 'strerror', None) or error}", file=shown) from error
+    if len(raw) > SIZE_MAX_BYTES:
+        size = f"{max(about.st_size, len(raw)) / 1e6:.1f} MB"
+        raise InputError.of("is too large for a configuration file", file=shown, given=size, allowed=allowed)
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -155,8 +195,9 @@ def parse_value(text: str) -> Any:
 def _compose(text: str, file: str) -> yaml.Node | None:
     try:
         return yaml.compose(text, Loader=_Loader)
-    except RecursionError as error:
-        raise InputError.of("is nested too deeply", file=file, allowed="a few levels of fields and lists") from error
+    except _LimitError as error:
+        message, allowed, line = error.args
+        raise InputError.of(message, file=file, line=line, allowed=allowed) from None
     except yaml.reader.ReaderError as error:
         line = text[: error.position].count("\n") + 1
         raise InputError.of(
@@ -182,6 +223,11 @@ def _line(node: yaml.Node) -> int:
     return int(node.start_mark.line) + 1
 
 
+def _is_unicode(text: str) -> bool:
+    """Whether all of ``text`` are characters; YAML's escapes can write halves of surrogate pairs."""
+    return not any("\ud800" <= c <= "\udfff" for c in text) if not text.isascii() else True
+
+
 class _Builder:
     """Turns nodes into plain data, gathering marks and problems on the way."""
 
@@ -198,8 +244,9 @@ class _Builder:
         if id(node) in within:
             self._problem(node, place, "an alias refers to the thing that it stands in")
             return None
-        if self.values > VALUES_MAX:
-            raise InputError.of("holds too many values", file=self.file, allowed=f"at most {VALUES_MAX}")
+        if self.values > VALUES_MAX or len(within) >= DEPTH_MAX:  # aliases multiply and nest what they stand for
+            message, allowed = _TOO_MANY if self.values > VALUES_MAX else _TOO_DEEP
+            raise InputError.of(message, file=self.file, line=_line(node), allowed=allowed)
         inner = (*within, id(node))
         if isinstance(node, yaml.MappingNode):
             return {key: self.build(v, (*place, key), inner, at) for key, v, at in self._entries(node, place)}
@@ -214,6 +261,10 @@ class _Builder:
             line = _line(key_node)
             if not isinstance(key_node, yaml.ScalarNode) or key_node.tag == _TAG + "null":
                 self._problem(key_node, place, "a field's name must be a word")
+            elif not _is_unicode(key):
+                self._problem(key_node, place, "holds a field's name with half of a pair of surrogates")
+            elif len(key) > FIELD_NAME_MAX:
+                self._problem(key_node, place, f"a field's name has at most {FIELD_NAME_MAX} characters")
             elif key in first:
                 self._problem(
                     key_node, (*place, key), f"is given twice, on lines {first[key]} and {line}", hint="remove one"
@@ -225,12 +276,18 @@ class _Builder:
     def _scalar(self, node: yaml.Node, place: Place) -> Any:
         text: str = node.value
         match node.tag.removeprefix(_TAG):
-            case "str":
+            case "str" if _is_unicode(text):
                 return text
+            case "str":
+                self._problem(node, place, "holds half of a pair of surrogates, which is no character")
+                return None
             case "null":
                 return None
             case "bool" if text.lower() in ("true", "false"):
                 return text.lower() == "true"
+            case "int" if _INT.fullmatch(text) and len(text) > DIGITS_MAX + 1:
+                self._problem(node, place, f"is a whole number of more than {DIGITS_MAX} digits")
+                return None
             case "int" if _INT.fullmatch(text):
                 return int(text, 0) if text.startswith(("0x", "0o")) else int(text)
             case "float" if _FLOAT.fullmatch(text) or _INT.fullmatch(text):

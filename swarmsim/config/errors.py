@@ -3,8 +3,13 @@
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
+
+PROBLEMS_MAX = 100
+"""Problems told at once: more help nobody, and looking for the nearest name of each takes time."""
+_TEXT_MAX = 2000  # characters of one part of a message
 
 
 @dataclass(frozen=True)
@@ -32,21 +37,30 @@ class Problem:
 
     def __str__(self) -> str:
         """A readable block: place and message on the first line, the rest indented below it."""
-        lines = [f"{self.where}: {self.message}" if self.where else self.message]
+        lines = [_readable(f"{self.where}: {self.message}" if self.where else self.message)]
         for label, value in (("given", self.given), ("allowed", self.allowed), ("hint", self.suggestion)):
             if value is not None:
-                lines.append(f"    {label + ':':<9}{value}")
+                lines.append(f"    {label + ':':<9}{_readable(value)}")
         return "\n".join(lines)
+
+
+def _readable(text: str) -> str:
+    """``text`` shortened, without characters that a terminal would obey or cannot show."""
+    text = text if len(text) <= _TEXT_MAX else text[: _TEXT_MAX - 1] + "…"
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 class InputError(Exception):
     """What a user gave cannot be used; ``problems`` holds every reason (the command line prints them, exit code 2)."""
 
     def __init__(self, problems: Iterable[Problem]):
-        """Hold ``problems`` (at least one)."""
-        self.problems: tuple[Problem, ...] = tuple(problems)
-        if not self.problems:
+        """Hold ``problems`` (at least one), the first `PROBLEMS_MAX` of them."""
+        found = first_problems(problems)
+        if not found:
             raise ValueError("an InputError needs at least one problem")
+        if len(found) > PROBLEMS_MAX:
+            found[PROBLEMS_MAX:] = [Problem("there are more problems than these")]
+        self.problems: tuple[Problem, ...] = tuple(found)
         super().__init__("\n".join(map(str, self.problems)))
 
     @classmethod
@@ -55,6 +69,11 @@ class InputError(Exception):
         if isinstance(where.get("file"), Path):
             where["file"] = str(where["file"])
         return cls([Problem(message=sentence, **where)])
+
+
+def first_problems(problems: Iterable[Problem]) -> list[Problem]:
+    """As many problems as are told, and one more where there are more; none is looked for beyond that."""
+    return list(islice(problems, PROBLEMS_MAX + 1))
 
 
 @contextmanager

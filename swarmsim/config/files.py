@@ -1,5 +1,6 @@
 """Where configuration files are: the working folder's ``configs`` first, then those that the package carries."""
 
+import os
 from pathlib import Path
 
 from swarmsim.config.errors import InputError
@@ -26,11 +27,11 @@ def config_dirs(near: Path | None = None) -> list[Path]:
     if near is not None:
         parents = near.absolute().parents
         found += [parents[i + 1] for i in range(min(2, len(parents) - 1)) if parents[i].name in KINDS]
-        found = [folder for folder in found if folder.resolve() != packaged_dir()]
+        found = [folder for folder in found if resolved(folder) != packaged_dir()]
     found += [folder for folder in (Path.cwd() / "configs", packaged_dir()) if folder.is_dir()]
     unique: dict[Path, Path] = {}
     for folder in found:
-        unique.setdefault(folder.resolve(), folder)
+        unique.setdefault(resolved(folder), folder)
     return list(unique.values())
 
 
@@ -49,6 +50,32 @@ def available(kind: str, near: Path | None = None) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
+def resolved(path: Path) -> Path:
+    """``path`` absolute and without links; as far as it goes where links lead in a circle."""
+    return Path(os.path.realpath(path))
+
+
+def exists(path: Path) -> bool:
+    """Whether ``path`` exists; not where no file could have that name (too long, a character that is not allowed)."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def is_file(path: Path) -> bool:
+    """Whether ``path`` is a regular file; not where no file could have that name."""
+    return exists(path) and path.is_file()
+
+
+def listing(folder: Path, pattern: str) -> list[Path]:
+    """What matches ``pattern`` in a folder; nothing where there is no such folder or it cannot be read."""
+    try:
+        return list(folder.glob(pattern))
+    except (OSError, ValueError):
+        return []
+
+
 def looks_like_path(name: str) -> bool:
     """Whether ``name`` is meant as a path (it has a folder or a YAML suffix) rather than as a configuration's name."""
     return "/" in name or "\\" in name or Path(name).suffix in _SUFFIXES
@@ -61,14 +88,14 @@ def find(kind: str, name: str | Path, near: Path | None = None) -> Path:
     """
     path = Path(name)
     if isinstance(name, Path) or looks_like_path(name):
-        if kind == "sites" and (path / "site.yaml").is_file():
+        if kind == "sites" and is_file(path / "site.yaml"):
             return path / "site.yaml"
-        if path.exists():
+        if exists(path):
             return path
     known = available(kind, near)
     if str(name) in known:
         return known[str(name)]
-    beside = sorted(str(path.with_name(p.name)) for p in path.parent.glob("*") if p.suffix in _SUFFIXES)
+    beside = sorted(str(path.parent / p.name) for p in listing(path.parent, "*") if p.suffix in _SUFFIXES)
     raise InputError.of(
         f"there is no {'file' if looks_like_path(str(name)) else kind.removesuffix('s')} '{name}'",
         given=str(name),

@@ -1,10 +1,10 @@
 """How a mission's multirotors fly: which effects are taken into account, and their failsafes."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
-from swarmsim.config.base import Fraction, Model, NonNegative, Positive
+from swarmsim.config.base import Delay, Fraction, Gap, Model
 
 
 class FlightEffects(Model):
@@ -36,8 +36,8 @@ class Fence(Failsafe):
     """The site's outline less ``margin_m``, and a ceiling above the terrain. It is felt a braking distance ahead."""
 
     action: Action = "return"
-    margin_m: NonNegative = 0.0
-    ceiling_m: Positive = 120.0
+    margin_m: Gap = 0.0
+    ceiling_m: Annotated[float, Field(ge=1, le=10_000)] = 120.0
 
 
 class WindFailsafe(Failsafe):
@@ -48,9 +48,9 @@ class WindFailsafe(Failsafe):
     """
 
     action: Action = "land"
-    share: float = Field(default=0.9, gt=0, le=1)
-    drift_m_s: NonNegative = 1.0
-    after_s: NonNegative = 8.0
+    share: float = Field(default=0.9, ge=0.01, le=1)
+    drift_m_s: Annotated[float, Field(ge=0, le=100)] = 1.0
+    after_s: Delay = 8.0
 
 
 class BatteryFailsafe(Failsafe):
@@ -63,8 +63,8 @@ class BatteryFailsafe(Failsafe):
 class LinkFailsafe(Failsafe):
     """Further than ``range_m`` from its start, where the ground station is, for ``after_s`` (PX4's COM_DL_LOSS_T)."""
 
-    range_m: Positive = 1000.0
-    after_s: NonNegative = 10.0
+    range_m: Annotated[float, Field(ge=0.1, le=1e6)] = 1000.0
+    after_s: Delay = 10.0
 
 
 class Failsafes(Model):
@@ -79,5 +79,5 @@ class Failsafes(Model):
     wind: WindFailsafe = WindFailsafe()
     battery: BatteryFailsafe = BatteryFailsafe()
     link: LinkFailsafe = LinkFailsafe()
-    return_clearance_m: NonNegative = 5.0
+    return_clearance_m: Gap = 5.0
     landing_clearance_m: float = Field(default=2.0, ge=0.0, le=100.0)

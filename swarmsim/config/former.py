@@ -5,7 +5,7 @@ from typing import Any
 import yaml
 
 from swarmsim.config.allowed import item
-from swarmsim.config.documents import Document, Place
+from swarmsim.config.documents import Document, Place, beginning
 from swarmsim.config.errors import Problem
 
 # The former section -> the phase's name, who follows it, its policy, when it starts.
@@ -99,11 +99,13 @@ def _moved_text(place: Place, value: Any) -> str:
 
 def _physics_steps(time_step_s: Any) -> int:
     """Time steps in a control period of `_CONTROL_PERIOD_S`, at least one; the default for what is no time step."""
-    known = isinstance(time_step_s, int | float) and time_step_s > 0
+    known = isinstance(time_step_s, int | float) and time_step_s > 0.01 * _CONTROL_PERIOD_S
     return max(1, round(_CONTROL_PERIOD_S / time_step_s)) if known else 2
 
 
 def _flow(value: Any) -> str:
     """``value`` as YAML on one line."""
-    text: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)
+    text: str = yaml.safe_dump(
+        beginning(value), default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6
+    )
     return text.strip()

@@ -1,6 +1,6 @@
 """YAML files to validated models: composition with ``extends``, overrides, and one error that says all."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.validation import validate
+
+EXTENDS_MAX = 20
 
 
 def load_model(path: str | Path, cls: Any) -> Any:
@@ -48,8 +50,8 @@ def _with_body(vehicle: Any, path: Path, document: Document) -> Any:
     """The vehicle with its body's file, written relative to the folder of the vehicle's file, made absolute."""
     if vehicle.body is None:
         return vehicle
-    file = path.parent.resolve() / vehicle.body.file
-    if not file.is_file():
+    file = files.resolved(path.parent) / vehicle.body.file
+    if not files.is_file(file):
         place = ("body", "file")
         raise InputError([document.problem(place, "there is no such file", given=vehicle.body.file)])
     return vehicle.model_copy(update={"body": vehicle.body.model_copy(update={"file": str(file)})})
@@ -86,26 +88,31 @@ def _extended(path: Path, kind: str | None, chain: tuple[Path, ...]) -> Document
     if not isinstance(parent, str):
         allowed = f"the name of one of the {kind}, or the path of a file"
         raise InputError([document.problem(place, "is not a name", given=str(parent), allowed=allowed)])
-    chain = (*chain, path.resolve())
+    chain = (*chain, files.resolved(path))
+    if len(chain) > EXTENDS_MAX:
+        allowed = f"at most {EXTENDS_MAX} files that extend each other"
+        raise InputError([document.problem(place, "is the end of too long a chain", given=parent, allowed=allowed)])
     parent_path = _parent_path(document, kind, parent, path)
-    if parent_path.resolve() in chain:
+    if files.resolved(parent_path) in chain:
         loop = " -> ".join(p.stem for p in (*chain, parent_path))
         raise InputError([document.problem(place, f"extends itself: {loop}", given=parent)])
     base = _extended(parent_path, kind, chain)
     merged = Document(base.data, base.marks, (path, *base.files))
     merged.marks[()] = document.marks[()]
     document.data.pop("extends")
-    _merge(merged, document, merged.data, document.data, (), ())
+    replaced: dict[Place, Place] = {}
+    _merge(merged, document, merged.data, document.data, (), (), replaced)
+    _take_marks(merged, document, replaced)
     return merged
 
 
 def _parent_path(document: Document, kind: str, parent: str, path: Path) -> Path:
     if files.looks_like_path(parent):
         beside = path.parent / parent
-        if beside.is_file():
+        if files.is_file(beside):
             return beside
     known = files.available(kind, path)
-    own = {name: p for name, p in known.items() if p.resolve() != path.resolve()}
+    own = {name: p for name, p in known.items() if files.resolved(p) != files.resolved(path)}
     if parent in own:
         return own[parent]
     if parent in known or parent == path.stem:
@@ -120,11 +127,20 @@ def _parent_path(document: Document, kind: str, parent: str, path: Path) -> Path
     raise InputError([problem])
 
 
-def _merge(into: Document, source: Document, old: Any, new: dict[str, Any], place: Place, origin: Place) -> None:
+def _merge(
+    into: Document,
+    source: Document,
+    old: Any,
+    new: dict[str, Any],
+    place: Place,
+    origin: Place,
+    replaced: dict[Place, Place],
+) -> None:
     """Merge mappings deeply; lists and single values replace those below them.
 
     A mapping over a list changes the items that it names (``phases: {survey: {time_limit_s: 300}}``). ``place`` is
-    where ``old`` stands in the merged document, ``origin`` is where ``new`` stands in its own.
+    where ``old`` stands in the merged document, ``origin`` is where ``new`` stands in its own. Each value that is
+    replaced adds both of its places to ``replaced``.
     """
     for key, value in new.items():
         there = (*origin, key)
@@ -133,11 +149,26 @@ def _merge(into: Document, source: Document, old: Any, new: dict[str, Any], plac
         below = old.get(known) if isinstance(old, dict) else old[known]
         if isinstance(value, dict) and (isinstance(below, dict) or _items_named(below)):
             into.marks[here] = source.marks[there]
-            _merge(into, source, below, value, here, there)
+            _merge(into, source, below, value, here, there, replaced)
         else:
             old[known] = value
-            marks = {(*here, *p[len(there) :]): m for p, m in source.marks.items() if p[: len(there)] == there}
-            into.replace(here, marks)
+            replaced[here] = there
+
+
+def _take_marks(into: Document, source: Document, replaced: dict[Place, Place]) -> None:
+    """Marks of the values of ``source`` that stand in ``into`` now, in the stead of those of what they replaced."""
+    origins = {there: here for here, there in replaced.items()}
+    kept = {place: mark for place, mark in into.marks.items() if _beginning_of(place, replaced) is None}
+    for place, mark in source.marks.items():
+        there = _beginning_of(place, origins)
+        if there is not None:
+            kept[(*origins[there], *place[len(there) :])] = mark
+    into.marks = kept
+
+
+def _beginning_of(place: Place, known: Mapping[Place, Place]) -> Place | None:
+    """The key of ``known`` that ``place`` begins with; None when there is none."""
+    return next((place[:n] for n in range(1, len(place) + 1) if place[:n] in known), None)
 
 
 def _place_in(into: Document, source: Document, old: Any, key: str, there: Place) -> str | int:

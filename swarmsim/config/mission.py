@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec2
+from swarmsim.config.base import Delay, Duration, Fraction, Gap, Length, Model, Name, Vec2
 from swarmsim.config.flight import Failsafes, FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
 from swarmsim.config.vehicles import Vehicle
@@ -39,15 +39,15 @@ class Source(Model):
     nuclide: Name
     position_m: Vec2
     height_m: float = Field(ge=-5, le=100)
-    activity_mbq: NonNegative
+    activity_mbq: float = Field(ge=0, le=1e9)
 
 
 class Formation(Model):
     """Members in a grid: rows of ``columns`` eastwards from the first member, further rows northwards."""
 
     count: int = Field(ge=2, le=TEAM_MAX)
-    columns: int = Field(ge=1)
-    spacing_m: Positive
+    columns: int = Field(ge=1, le=TEAM_MAX)
+    spacing_m: float = Field(ge=0.01, le=1000)
 
 
 class TeamMember(Model):
@@ -77,9 +77,9 @@ class Wind(Model):
 class Traffic(Model):
     """Least distances, m, between UAVs in flight, between rovers, and between vehicles' outlines at the start."""
 
-    separation_m: Positive = 6.0
-    ground_separation_m: NonNegative = 2.0
-    pad_gap_m: NonNegative = 0.5
+    separation_m: float = Field(default=6.0, ge=0.01, le=1000)
+    ground_separation_m: Gap = 2.0
+    pad_gap_m: Gap = 0.5
 
 
 class Radio(Model):
@@ -88,7 +88,7 @@ class Radio(Model):
     ``mates`` is how many team mates, the nearest in range, a policy sees.
     """
 
-    range_m: Positive | None = None
+    range_m: float | None = Field(default=None, ge=0.1, le=1e6)
     loss: Fraction = 0.0
     delay_s: float = Field(default=0.0, ge=0, le=10)
     mates: int = Field(default=8, ge=1, le=64)
@@ -97,11 +97,11 @@ class Radio(Model):
 class Mapping(Model):
     """Counts to a map, map to hotspots."""
 
-    cell_m: Positive
-    length_scale_m: Positive
+    cell_m: float = Field(ge=0.05, le=1000)
+    length_scale_m: float = Field(ge=0.01, le=10_000)
     hotspots_max: int = Field(ge=1, le=16)
-    hotspot_separation_m: Positive
-    significance_sigma: Positive
+    hotspot_separation_m: Length
+    significance_sigma: float = Field(ge=0.1, le=100)
 
 
 class Localisation(Model):
@@ -109,13 +109,13 @@ class Localisation(Model):
 
     presumed_nuclide: Name
     presumed_height_m: float = Field(ge=-5, le=100)
-    height_std_m: NonNegative
-    window_s: Positive
+    height_std_m: float = Field(ge=0, le=100)
+    window_s: float = Field(ge=1e-3, le=3600)
     rays_per_window: int = Field(default=3, ge=1, le=32)
     starts: int = Field(ge=1, le=64)
     iterations: int = Field(ge=10, le=10_000)
-    learning_rate_m: Positive
-    search_radius_m: Positive = 6.0
+    learning_rate_m: float = Field(ge=1e-4, le=100)
+    search_radius_m: float = Field(default=6.0, ge=0.01, le=1000)
     search_rounds: int = Field(default=3, ge=0, le=1000)
     fisher_steps: int = Field(default=6, ge=1, le=100)
     sample_rounds: int = Field(default=6, ge=1, le=100)
@@ -128,7 +128,7 @@ class Identification(Model):
     A nuclide is named when its confidence is at least ``confidence_min``.
     """
 
-    spectrum_radius_m: Positive
+    spectrum_radius_m: float = Field(ge=0.01, le=10_000)
     confidence_min: Fraction
 
 
@@ -138,10 +138,10 @@ class Trigger(Model):
     ``delay_s`` is added to any of the three.
     """
 
-    at_s: NonNegative | None = None
+    at_s: Delay | None = None
     after: Name | None = None
     when: Literal["hotspot"] | None = None
-    delay_s: NonNegative = 0.0
+    delay_s: Delay = 0.0
 
     @model_validator(mode="after")
     def _one_condition(self) -> "Trigger":
@@ -155,6 +155,9 @@ def _as_tuple(who: Any) -> Any:
     return (who,) if isinstance(who, str) else tuple(who) if isinstance(who, list) else who
 
 
+_Names = Annotated[tuple[Name, ...], Field(min_length=1, max_length=TEAM_MAX)]
+
+
 class Phase(Model):
     """A part of the mission: who follows which policy, and from when to when.
 
@@ -166,15 +169,16 @@ class Phase(Model):
 
     name: Name
     who: Annotated[
-        tuple[Name, ...],
-        Field(min_length=1, max_length=TEAM_MAX),
-        BeforeValidator(_as_tuple, json_schema_input_type=Name | tuple[Name, ...]),
+        _Names,
+        BeforeValidator(
+            _as_tuple, json_schema_input_type=Name | Annotated[tuple[Name, ...], Field(max_length=TEAM_MAX)]
+        ),
     ]
     policy: str = Field(min_length=1)
     settings: dict[str, Any] = Field(default_factory=dict)
     start: Trigger = Trigger(at_s=0.0)
     end: Trigger | None = None
-    time_limit_s: Positive
+    time_limit_s: Duration
 
 
 class Definitions(Model):

@@ -59,7 +59,7 @@ def _known_step(node: Any, step: str, place: Place, document: Document, shape: S
     """The key or index that ``step`` means in ``node``; raises with the nearest when there is none."""
     here = dotted(place) or "the top level"
     if isinstance(node, list):
-        if step.isdigit() and int(step) < len(node):
+        if step.isascii() and step.isdigit() and len(step) < 10 and int(step) < len(node):
             return int(step)
         names = [item["name"] for item in node if isinstance(item, dict) and isinstance(item.get("name"), str)]
         if step in names:

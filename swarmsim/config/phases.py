@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swarmsim.config.allowed import item
 from swarmsim.config.documents import Document, Place, dotted
 from swarmsim.config.errors import InputError, Problem
-from swarmsim.config.mission import Trigger
+from swarmsim.config.mission import PHASES_MAX, Trigger
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.policies import LandOn, PolicySettings
 from swarmsim.config.validation import validate
@@ -32,29 +33,39 @@ def read_settings(document: Document, near: Path | None) -> tuple[list[PolicySet
     phases = item(document.data, "phases")
     settings: list[PolicySettings | None] = []
     problems: list[Problem] = []
-    for i, phase in enumerate(phases if isinstance(phases, list) else ()):
+    models = cache(partial(_model_of, near=near))  # looking for a policy that does not exist takes time
+    for i, phase in enumerate(phases[:PHASES_MAX] if isinstance(phases, list) else ()):
         try:
-            settings.append(_settings_of(document, i, phase, near))
+            settings.append(_settings_of(document, i, phase, models))
         except InputError as error:
             settings.append(None)
             problems += error.problems
     return settings, problems
 
 
-def _settings_of(document: Document, index: int, phase: Any, near: Path | None) -> PolicySettings | None:
+def _model_of(policy: str, near: Path | None) -> type[PolicySettings] | InputError:
+    """The model of a policy's settings, or what is wrong with the policy."""
+    from swarmsim.policies import registry
+
+    try:
+        return registry.settings_model(policy, near)
+    except InputError as error:
+        return error
+
+
+def _settings_of(
+    document: Document, index: int, phase: Any, models: Callable[[str], type[PolicySettings] | InputError]
+) -> PolicySettings | None:
     policy, given = item(phase, "policy"), item(phase, "settings")
     if not isinstance(policy, str) or not policy:
         return None  # the validation of the mission tells it
     place: Place = ("phases", index, "policy")
-    from swarmsim.policies import registry
-
-    try:
-        model = registry.settings_model(policy, near)
-    except InputError as error:
+    model = models(policy)
+    if isinstance(model, InputError):
         raise InputError(
             document.problem(place, p.message, given=p.given, allowed=p.allowed, suggestion=p.suggestion)
-            for p in error.problems
-        ) from error
+            for p in model.problems
+        ) from model
     if given is not None and not isinstance(given, dict):
         return None
     place = ("phases", index, "settings")

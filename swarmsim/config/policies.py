@@ -1,11 +1,11 @@
 """Settings of the policies, as they stand under ``phases.N.settings``."""
 
 from collections.abc import Iterator, Mapping
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from swarmsim.config.base import ConvexPolygon, Model, Name, NonNegative, Positive, Vec2
+from swarmsim.config.base import ConvexPolygon, Gap, Model, Name, Vec2
 from swarmsim.config.vehicles import VEHICLE_KINDS
 
 Target = Literal["source", "hotspot"] | Vec2
@@ -47,10 +47,10 @@ class _Targeted(PolicySettings):
 class _Flown(PolicySettings):
     """Vertical speeds, and the height kept above the highest surface nearby, of policies that fly."""
 
-    climb_speed_m_s: float = Field(default=2.0, gt=0, le=10)
-    descent_speed_m_s: float = Field(default=1.5, gt=0, le=5)
-    touchdown_speed_m_s: float = Field(default=0.5, gt=0, le=2)
-    obstacle_clearance_m: NonNegative = 5.0
+    climb_speed_m_s: float = Field(default=2.0, ge=0.01, le=10)
+    descent_speed_m_s: float = Field(default=1.5, ge=0.01, le=5)
+    touchdown_speed_m_s: float = Field(default=0.5, ge=0.01, le=2)
+    obstacle_clearance_m: Gap = 5.0
 
 
 class ParallelLines(_Flown):
@@ -63,9 +63,9 @@ class ParallelLines(_Flown):
     vehicles: ClassVar[tuple[str, ...]] = ("multirotor",)
 
     altitude_m: float = Field(gt=1, le=200)
-    line_spacing_m: Positive | None = None
+    line_spacing_m: Annotated[float, Field(ge=0.1, le=1000)] | None = None
     sweep_deg: float = Field(default=0.0, ge=-360, le=360)
-    speed_m_s: float = Field(gt=0, le=30)
+    speed_m_s: float = Field(ge=0.01, le=30)
     area_m: ConvexPolygon | None = None
 
 
@@ -74,8 +74,8 @@ class ApproachAndOrbit(_Targeted):
 
     vehicles: ClassVar[tuple[str, ...]] = ("skid_steer",)
 
-    speed_m_s: float = Field(gt=0, le=5)
-    standoff_m: Positive = 4.0
+    speed_m_s: float = Field(ge=0.01, le=5)
+    standoff_m: Annotated[float, Field(ge=0.01, le=1000)] = 4.0
     viewpoints: int = Field(default=8, ge=1, le=64)
     laps: int = Field(default=1, ge=1, le=10)
     target: Target = "source"
@@ -86,10 +86,10 @@ class Orbit(_Targeted, _Flown):
 
     vehicles: ClassVar[tuple[str, ...]] = ("multirotor",)
 
-    radius_m: Positive
+    radius_m: Annotated[float, Field(ge=0.1, le=1000)]
     altitude_m: float = Field(gt=1, le=200)
-    speed_m_s: float = Field(gt=0, le=30)
-    turns: float = Field(default=1.0, gt=0, le=100)
+    speed_m_s: float = Field(ge=0.01, le=30)
+    turns: float = Field(default=1.0, ge=0.01, le=100)
     target: Target = "hotspot"
 
 
@@ -97,7 +97,7 @@ class Waypoints(_Flown):
     """Visit points (ENU, m) in their order, ``laps`` times; ``altitude_m`` above ground is for multirotors only."""
 
     points: tuple[Vec2, ...] = Field(min_length=1, max_length=1000)
-    speed_m_s: float = Field(gt=0, le=30)
+    speed_m_s: float = Field(ge=0.01, le=30)
     altitude_m: float | None = Field(default=None, gt=1, le=200)
     laps: int = Field(default=1, ge=1, le=100)
 
@@ -120,7 +120,7 @@ class LandOn(_Flown):
 
     rover: Name
     altitude_m: float = Field(default=4.0, gt=1, le=200)
-    speed_m_s: float = Field(gt=0, le=30)
+    speed_m_s: float = Field(ge=0.01, le=30)
 
 
 class Hold(PolicySettings):

@@ -1,11 +1,16 @@
 """Nuclides, materials and detectors as a user writes them."""
 
 from itertools import pairwise
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from swarmsim.config.base import Fraction, Model, Name, NonNegative, Positive, Vec3
+from swarmsim.config.base import Fraction, Model, Name, PhotonEnergy, Vec3
+
+TABLE_MAX = 1000  # rows of a table
+MassFraction = Annotated[float, Field(ge=1e-9, le=1)]
+CrystalSize = Annotated[float, Field(ge=0.1, le=2000)]  # mm
+DeadTimeUs = Annotated[float, Field(ge=0, le=1e6)]
 
 ELEMENTS = frozenset(
     """
@@ -21,7 +26,7 @@ class Line(Model):
     """One gamma or X-ray line: photon energy and photons per hundred decays."""
 
     energy_kev: float = Field(ge=30, lt=10_000)
-    yield_percent: float = Field(gt=0, le=400)
+    yield_percent: float = Field(ge=1e-9, le=400)
 
 
 class Nuclide(Model):
@@ -31,7 +36,7 @@ class Nuclide(Model):
     """
 
     name: Name
-    half_life_s: Positive
+    half_life_s: float = Field(ge=1e-3, le=1e30)
     lines: tuple[Line, ...] = Field(min_length=1, max_length=64)
     source: str
 
@@ -43,8 +48,8 @@ class Material(Model):
     """
 
     name: Name
-    density_kg_m3: float = Field(gt=0, le=25_000)
-    composition: dict[str, float] = Field(min_length=1, max_length=40)
+    density_kg_m3: float = Field(ge=1e-3, le=30_000)
+    composition: dict[str, MassFraction] = Field(min_length=1, max_length=40)
     source: str
 
     @property
@@ -58,8 +63,6 @@ class Material(Model):
         unknown = [symbol for symbol in self.composition if symbol not in ELEMENTS]
         if unknown:
             raise ValueError(f"composition has no element {', '.join(unknown)}: use the symbols H to Cf, such as Fe")
-        if any(not 0.0 < share <= 1.0 for share in self.composition.values()):
-            raise ValueError("the mass fractions of composition must lie above 0 and be at most 1")
         if not 0.98 <= sum(self.composition.values()) <= 1.02:
             total = sum(self.composition.values())
             raise ValueError(f"the mass fractions of composition must add up to 1 (they add up to {total:.4g})")
@@ -70,8 +73,8 @@ class DeadTime(Model):
     """Dead-time law applied to everything the crystal sees, background included."""
 
     model: Literal["none", "paralyzable", "non_paralyzable", "hybrid"] = "none"
-    paralyzable_us: NonNegative = 0.0
-    non_paralyzable_us: NonNegative = 0.0
+    paralyzable_us: DeadTimeUs = 0.0
+    non_paralyzable_us: DeadTimeUs = 0.0
 
     @model_validator(mode="after")
     def _consistent(self) -> "DeadTime":
@@ -85,30 +88,30 @@ class DeadTime(Model):
 class EfficiencyPoint(Model):
     """Counts per photon that meets a counter without energy resolution, at one energy."""
 
-    energy_kev: Positive
-    efficiency: float = Field(gt=0, le=1)
+    energy_kev: PhotonEnergy
+    efficiency: float = Field(ge=1e-6, le=1)
 
 
 class Housing(Model):
     """What a photon crosses before the crystal."""
 
     material: Name
-    thickness_mm: NonNegative
+    thickness_mm: float = Field(ge=0, le=1000)
 
 
 class BackgroundLine(Model):
     """One natural gamma line and its share of the background counts."""
 
-    energy_kev: Positive
+    energy_kev: PhotonEnergy
     share: Fraction
 
 
 class Background(Model):
     """Natural background: counts per second, and its spectrum (lines on a continuum exp(-E / continuum_kev))."""
 
-    rate_cps: NonNegative
-    continuum_kev: Positive
-    lines: tuple[BackgroundLine, ...] = ()
+    rate_cps: float = Field(ge=0, le=1e7)
+    continuum_kev: PhotonEnergy
+    lines: tuple[BackgroundLine, ...] = Field(default=(), max_length=64)
 
     @model_validator(mode="after")
     def _shares(self) -> "Background":
@@ -121,9 +124,9 @@ class Spectrometer(Model):
     """Multichannel analyser of a detector."""
 
     channels: int = Field(ge=64, le=16_384)
-    energy_max_kev: Positive
-    threshold_kev: Positive
-    resolution_percent_at_662_kev: float = Field(gt=0, le=50)
+    energy_max_kev: float = Field(ge=100, le=100_000)
+    threshold_kev: PhotonEnergy
+    resolution_percent_at_662_kev: float = Field(ge=0.01, le=50)
 
     @model_validator(mode="after")
     def _threshold_below_end(self) -> "Spectrometer":
@@ -142,13 +145,13 @@ class Detector(Model):
 
     name: Name
     crystal: Name | None = None
-    efficiency: tuple[EfficiencyPoint, ...] | None = Field(default=None, min_length=2, max_length=200)
-    diameter_mm: float = Field(gt=0, le=2000)
-    length_mm: float = Field(gt=0, le=2000)
+    efficiency: tuple[EfficiencyPoint, ...] | None = Field(default=None, min_length=2, max_length=TABLE_MAX)
+    diameter_mm: CrystalSize
+    length_mm: CrystalSize
     housing: Housing
     background: Background
     dead_time: DeadTime
-    sample_period_s: float = Field(gt=0, le=3600)
+    sample_period_s: float = Field(ge=1e-3, le=3600)
     spectrometer: Spectrometer | None = None
     backscatter_share: Fraction = 0.0
     sources: dict[str, str]
@@ -176,6 +179,6 @@ class DetectorMount(Model):
 
     @model_validator(mode="after")
     def _axis_has_a_direction(self) -> "DetectorMount":
-        if not any(self.axis):
+        if max(map(abs, self.axis)) < 1e-6:
             raise ValueError("axis must not be (0, 0, 0)")
         return self

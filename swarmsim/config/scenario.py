@@ -142,7 +142,7 @@ def resolve(document: Document, near: Path | None, problems: list[Problem]) -> S
     at_fault = {problem.path for problem in problems}
     others = (*check_references(document, near), *of_settings)
     problems += [problem for problem in others if problem.path not in at_fault]
-    raise_if_any(sorted(problems, key=lambda p: (p.file != ORIGIN, p.file or "", p.line or 0)))
+    raise_if_any(sorted(problems, key=lambda p: (p.file is None, p.file != ORIGIN, p.file or "", p.line or 0)))
     assert mission is not None
     complete = tuple(each for each in settings if each is not None)
     scenario = _look_up(_with_settings(mission, complete), complete, document, near)

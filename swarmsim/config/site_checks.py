@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swarmsim.config.checks import footprint_radius_m
 from swarmsim.config.documents import Place
-from swarmsim.config.errors import Problem
+from swarmsim.config.errors import Problem, first_problems
 from swarmsim.config.policies import ApproachAndOrbit, Orbit, ParallelLines, Waypoints, line_spacing
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
@@ -35,12 +35,8 @@ def check_site(scenario: Scenario, model: SiteModel | None = None) -> list[Probl
 
         model = load_site(scenario.site_file, tuple(scenario.materials))
     ground = _Ground(model.site, scenario)
-    return [
-        *_check_sources(scenario, ground),
-        *_check_vehicles(scenario, ground),
-        *_check_areas(scenario, ground),
-        *_check_points(scenario, ground),
-    ]
+    checks = (_check_sources, _check_vehicles, _check_areas, _check_points)
+    return first_problems(problem for check in checks for problem in check(scenario, ground))
 
 
 class _Ground:

@@ -22,11 +22,12 @@ def expand(member: TeamMember) -> tuple[TeamMember, ...]:
         return (member,)
     (x, y), spacing = member.position_m, formation.spacing_m
     return tuple(
-        TeamMember(
-            name=f"{member.name}{k + 1}",
-            type=member.type,
-            position_m=(x + spacing * (k % formation.columns), y + spacing * (k // formation.columns)),
-            heading_deg=member.heading_deg,
+        member.model_copy(
+            update={
+                "name": f"{member.name}{k + 1}",
+                "position_m": (x + spacing * (k % formation.columns), y + spacing * (k // formation.columns)),
+                "formation": None,
+            }
         )
         for k in range(formation.count)
     )

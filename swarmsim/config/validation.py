@@ -8,8 +8,8 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from swarmsim.config.allowed import Shape, item, shape_of
-from swarmsim.config.documents import Document, Place, dump_yaml
-from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.documents import Document, Place, beginning, dump_yaml
+from swarmsim.config.errors import PROBLEMS_MAX, InputError, Problem
 from swarmsim.config.former import former_problems
 from swarmsim.config.mission import Mission
 from swarmsim.config.names import did_you_mean, one_of
@@ -25,6 +25,7 @@ _NOT = {
     "model": "a mapping",
     "model_attributes": "a mapping",
 }
+_CHARACTERS_SHOWN = 100
 
 
 @cache
@@ -50,6 +51,8 @@ def problems_of(error: ValidationError, document: Document, cls: Any) -> list[Pr
     explained = {tuple((problem.path or "").split("."))[:1] for problem in former}
     found: dict[Place, Problem] = {}
     for details in error.errors(include_url=False):
+        if len(found) > PROBLEMS_MAX:
+            break
         place = _place(details, document.data)
         if place in explained or (former and place == ("phases",) and details["type"] == "missing"):
             continue
@@ -119,6 +122,8 @@ def _message(details: ErrorDetails) -> str:
         return "is not a finite number"
     if kind == "string_pattern_mismatch":
         return "is not a valid name"
+    if kind == "string_too_long":
+        return "is too long"
     if kind == "string_too_short":
         return "is empty"
     if kind == "int_from_float":
@@ -145,7 +150,8 @@ def shown(value: Any) -> str:
         return "nothing"
     if isinstance(value, float | int | bool | str):
         text = str(value).lower() if isinstance(value, bool) else str(value)
+    elif isinstance(value, list):
+        text = json.dumps(beginning(value), ensure_ascii=False)
     else:
-        text = " ".join(dump_yaml(value).split())
-        text = json.dumps(value, ensure_ascii=False) if isinstance(value, list) else text
-    return text if len(text) <= 100 else text[:97] + "…"
+        text = " ".join(dump_yaml(beginning(value)).split())
+    return text if len(text) <= _CHARACTERS_SHOWN else text[: _CHARACTERS_SHOWN - 3] + "…"

@@ -6,7 +6,23 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from swarmsim.config.base import Model, Name, NonNegative, Positive, PositiveVec3, Vec3
+from swarmsim.config.base import (
+    Acceleration,
+    Damping,
+    Fraction,
+    Friction,
+    Gain,
+    Lag,
+    Mass,
+    Model,
+    Name,
+    Part,
+    Power,
+    RotationSpeed,
+    Speed,
+    Stiffness,
+    Vec3,
+)
 from swarmsim.config.radiation import DetectorMount
 
 
@@ -61,7 +77,7 @@ def _inertia(numbers: tuple[float, ...]) -> tuple[float, ...]:
         raise ValueError("give three principal moments, or the six elements Ixx, Iyy, Izz, Ixy, Ixz, Iyz of the tensor")
     moments = np.linalg.eigvalsh(inertia_tensor(numbers))
     words = ", ".join(f"{moment:.6g}" for moment in moments)
-    if moments[0] <= 0.0:
+    if moments[0] <= 1e-12:
         raise ValueError(f"the tensor of inertia must be positive definite: its principal moments are {words}")
     if moments[2] > (1.0 + 1e-6) * (moments[0] + moments[1]):
         raise ValueError(f"no body has these principal moments: the largest of {words} exceeds the sum of the others")
@@ -74,32 +90,37 @@ def inertia_tensor(numbers: tuple[float, ...]) -> np.ndarray:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-Inertia = Annotated[tuple[float, ...], Field(min_length=3, max_length=6), AfterValidator(_inertia)]
+Moment = Annotated[float, Field(ge=-1e6, le=1e6)]  # kg m2
+Inertia = Annotated[tuple[Moment, ...], Field(min_length=3, max_length=6), AfterValidator(_inertia)]
 """Inertia about the centre of mass (kg m^2, body FLU): the three principal moments where the body's axes are the
 principal ones, or the six elements [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of the tensor, in the order of MuJoCo's
 ``fullinertia``. As there and in URDF the last three are the elements themselves, Ixy the integral of -x y dm."""
 
 
+Drag = Annotated[float, Field(ge=0, le=1000)]  # kg/m
+Argument = Annotated[float, Field(ge=-1e9, le=1e9)] | Annotated[int, Field(ge=-(10**9), le=10**9)]
+
+
 class BodyFile(Model):
     """A URDF or xacro file that gives the body (mass, inertia, visual geometry), with its xacro arguments."""
 
-    file: str
-    args: dict[str, str | float | int | bool] = Field(default_factory=dict)
+    file: str = Field(min_length=1)
+    args: dict[str, str | Argument | bool] = Field(default_factory=dict)
 
 
 class Battery(Model):
     """Energy store: capacity, efficiency from battery to shaft, and what the avionics draw."""
 
-    capacity_wh: Positive
+    capacity_wh: Annotated[float, Field(ge=1e-3, le=1e6)]
     drive_efficiency: Annotated[float, Field(gt=0, le=1)]
-    avionics_power_w: NonNegative
+    avionics_power_w: Power
 
 
 class FlightBattery(Battery):
     """Lithium-polymer pack of a multirotor: its cells in series and its resistance."""
 
-    cells: Annotated[int, Field(ge=1)]
-    resistance_ohm: NonNegative
+    cells: Annotated[int, Field(ge=1, le=100)]
+    resistance_ohm: Annotated[float, Field(ge=0, le=100)]
 
 
 class Rotor(Model):
@@ -120,19 +141,19 @@ class RotorModel(Model):
     left out.
     """
 
-    thrust_coefficient_n_s2: Positive
-    moment_constant_m: Positive
-    time_constant_up_s: Positive
-    time_constant_down_s: Positive
-    speed_min_rad_s: NonNegative
-    speed_max_rad_s: Positive
-    speed_max_voltage_v: Positive
-    inertia_kg_m2: NonNegative
-    radius_m: Positive
+    thrust_coefficient_n_s2: Annotated[float, Field(ge=1e-12, le=100)]
+    moment_constant_m: Annotated[float, Field(ge=1e-6, le=10)]
+    time_constant_up_s: Lag
+    time_constant_down_s: Lag
+    speed_min_rad_s: Annotated[float, Field(ge=0, le=1e5)]
+    speed_max_rad_s: RotationSpeed
+    speed_max_voltage_v: Annotated[float, Field(ge=0.1, le=1000)]
+    inertia_kg_m2: Annotated[float, Field(ge=0, le=100)]
+    radius_m: Part
     figure_of_merit: Annotated[float, Field(gt=0, le=1)]
-    solidity: Positive | None = None
-    drag_kg: NonNegative | None = None
-    rolling_moment_kg_m: NonNegative | None = None
+    solidity: Annotated[float, Field(ge=1e-3, le=1)] | None = None
+    drag_kg: Annotated[float, Field(ge=0, le=1)] | None = None
+    rolling_moment_kg_m: Annotated[float, Field(ge=0, le=1)] | None = None
     speed_noise: Annotated[float, Field(ge=0, le=0.2)] | None = None
 
 
@@ -143,27 +164,27 @@ class Feet(Model):
     of a foot that sticks.
     """
 
-    positions_m: tuple[Vec3, ...] = Field(min_length=3)
-    stiffness_n_m: Positive
-    tangential_stiffness_n_m: Positive
-    damping_n_s_m: NonNegative
-    friction: NonNegative
+    positions_m: tuple[Vec3, ...] = Field(min_length=3, max_length=32)
+    stiffness_n_m: Stiffness
+    tangential_stiffness_n_m: Stiffness
+    damping_n_s_m: Damping
+    friction: Friction
 
 
 class MultirotorControl(Model):
     """Cascaded controller: natural frequencies and limits."""
 
-    position_gain_1_s: Positive
-    velocity_gain_1_s: Positive
-    velocity_integral_1_s2: NonNegative
-    attitude_gain_1_s: Positive
-    yaw_gain_1_s: Positive
-    rate_gain_1_s: Positive
-    yaw_rate_max_deg_s: Positive
-    tilt_max_deg: float = Field(gt=0, lt=80)
-    speed_max_m_s: Positive
-    climb_rate_max_m_s: Positive
-    acceleration_max_m_s2: Positive
+    position_gain_1_s: Gain
+    velocity_gain_1_s: Gain
+    velocity_integral_1_s2: Annotated[float, Field(ge=0, le=1000)]
+    attitude_gain_1_s: Gain
+    yaw_gain_1_s: Gain
+    rate_gain_1_s: Gain
+    yaw_rate_max_deg_s: Annotated[float, Field(ge=0.1, le=10_000)]
+    tilt_max_deg: float = Field(ge=0.1, lt=80)
+    speed_max_m_s: Speed
+    climb_rate_max_m_s: Speed
+    acceleration_max_m_s2: Acceleration
 
 
 class Multirotor(Sourced):
@@ -177,15 +198,15 @@ class Multirotor(Sourced):
     kind: Literal["multirotor"]
     name: Name
     description: str
-    mass_kg: Positive
+    mass_kg: Mass
     inertia_kg_m2: Inertia
-    rotors: tuple[Rotor, ...] = Field(min_length=3)
+    rotors: tuple[Rotor, ...] = Field(min_length=3, max_length=32)
     rotor: RotorModel
-    drag_quadratic_kg_m: NonNegative | tuple[NonNegative, NonNegative, NonNegative]
+    drag_quadratic_kg_m: Drag | tuple[Drag, Drag, Drag]
     feet: Feet
-    collision_radius_m: Positive
-    collision_height_m: Positive
-    impact_speed_max_m_s: Positive
+    collision_radius_m: Part
+    collision_height_m: Part
+    impact_speed_max_m_s: Speed
     battery: FlightBattery
     control: MultirotorControl
     detector: DetectorMount | None = None
@@ -214,8 +235,8 @@ class Castors(Model):
     sides against its own small ``friction``. ``load_share`` is the share of the weight on the two, on level ground.
     """
 
-    friction: Positive
-    load_share: float = Field(gt=0, lt=1)
+    friction: Annotated[float, Field(ge=1e-4, le=10)]
+    load_share: float = Field(ge=1e-3, lt=1)
 
 
 class Wheels(Model):
@@ -224,15 +245,15 @@ class Wheels(Model):
     ``stiffness_n_m`` is load over sinkage of one tyre, ``damping_ratio`` that of the rover bouncing on its four tyres.
     """
 
-    radius_m: Positive
-    width_m: Positive
-    mass_kg: Positive
-    wheel_base_m: Positive
-    track_m: Positive
-    friction: Positive
-    rolling_resistance: NonNegative
-    stiffness_n_m: Positive
-    damping_ratio: Positive
+    radius_m: Part
+    width_m: Part
+    mass_kg: Mass
+    wheel_base_m: Part
+    track_m: Part
+    friction: Annotated[float, Field(ge=1e-4, le=10)]
+    rolling_resistance: Fraction
+    stiffness_n_m: Stiffness
+    damping_ratio: Annotated[float, Field(ge=1e-3, le=100)]
     castors: Castors | None = None
 
 
@@ -242,29 +263,29 @@ class WheelMotor(Model):
     ``rotor_inertia_kg_m2`` is that of rotor and gears as the wheel feels it, the square of the gear ratio included.
     """
 
-    rotor_inertia_kg_m2: NonNegative
-    torque_max_nm: Positive
-    time_constant_s: Positive
-    speed_gain_nm_s: Positive
-    speed_max_rad_s: Positive
+    rotor_inertia_kg_m2: Annotated[float, Field(ge=0, le=1000)]
+    torque_max_nm: Annotated[float, Field(ge=1e-4, le=1e5)]
+    time_constant_s: Lag
+    speed_gain_nm_s: Annotated[float, Field(ge=1e-5, le=1e5)]
+    speed_max_rad_s: RotationSpeed
 
 
 class Bumper(Model):
     """Spring-damper of each point of the chassis that meets ground or the edge of a step, with Coulomb friction."""
 
-    stiffness_n_m: Positive
-    damping_n_s_m: NonNegative
-    friction: NonNegative
+    stiffness_n_m: Stiffness
+    damping_n_s_m: Damping
+    friction: Friction
 
 
 class SkidSteerControl(Model):
     """Path following of a skid-steer rover (pure pursuit)."""
 
-    lookahead_m: Positive
-    speed_max_m_s: Positive
-    yaw_rate_max_rad_s: Positive
-    acceleration_max_m_s2: Positive
-    yaw_gain_1_s: Positive
+    lookahead_m: Annotated[float, Field(ge=1e-3, le=100)]
+    speed_max_m_s: Speed
+    yaw_rate_max_rad_s: Annotated[float, Field(ge=1e-3, le=100)]
+    acceleration_max_m_s2: Acceleration
+    yaw_gain_1_s: Gain
 
 
 class SkidSteer(Sourced):
@@ -273,15 +294,15 @@ class SkidSteer(Sourced):
     kind: Literal["skid_steer"]
     name: Name
     description: str
-    mass_kg: Positive
-    chassis_size_m: PositiveVec3
-    chassis_height_m: Positive
+    mass_kg: Mass
+    chassis_size_m: tuple[Part, Part, Part]
+    chassis_height_m: Part
     wheels: Wheels
     motor: WheelMotor
     bumper: Bumper
-    impact_speed_max_m_s: Positive
-    slope_max_deg: float = Field(gt=0, lt=60)
-    step_max_m: Positive
+    impact_speed_max_m_s: Speed
+    slope_max_deg: float = Field(ge=0.1, lt=60)
+    step_max_m: Part
     battery: Battery
     control: SkidSteerControl
     detector: DetectorMount | None = None

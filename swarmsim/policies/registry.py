@@ -9,6 +9,7 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
+import os
 import pkgutil
 import sys
 import traceback
@@ -19,6 +20,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
+from swarmsim.config import files
 from swarmsim.config.documents import shown_path
 from swarmsim.config.errors import InputError
 from swarmsim.config.names import did_you_mean, one_of
@@ -182,12 +184,14 @@ def _loaded_entry_point(name: str, point: EntryPoint) -> Any:
 
 def _existing_file(reference: str, near: Path | None) -> Path:
     """Absolute path of the file of a reference: in the folder of ``near``, else in the working folder."""
-    path = Path(reference.rpartition(":")[0]).expanduser()
+    path = Path(os.path.expanduser(reference.rpartition(":")[0]))  # leaves the name of an unknown user as it is
     folders = [Path.cwd()] if near is None else [near.absolute().parent, Path.cwd()]
     for folder in folders:
-        if (folder / path).is_file():
+        if files.is_file(folder / path):
             return (folder / path).resolve()
-    beside = sorted(str(path.with_name(p.name)) for folder in folders for p in (folder / path).parent.glob("*.py"))
+    beside = sorted(
+        str(path.parent / p.name) for folder in folders for p in files.listing((folder / path).parent, "*.py")
+    )
     raise InputError.of(
         f"there is no file '{path}' to take a policy from",
         given=reference,
@@ -233,7 +237,7 @@ def _executed(reference: str, path: Path, sha256: str) -> ModuleType:
 def _module(reference: str, name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         if isinstance(error, ModuleNotFoundError) and error.name and f"{name}.".startswith(f"{error.name}."):
             hint = f"install it, or name its file: '{name.rpartition('.')[2]}.py:{reference.rpartition(':')[2]}'"
             raise InputError.of(f"there is no module '{error.name}'", given=reference, suggestion=hint) from error

@@ -1,11 +1,15 @@
-"""Where a run may be written."""
+"""Where a run may be written, and where its results are kept when that fails."""
 
+import shutil
 import tempfile
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
 from swarmsim.config.errors import InputError, file_errors_told
 from swarmsim.results.names import SCENARIO, SUMMARY
+
+SPACE_BYTES = 100_000_000  # several times the largest of the shipped missions' runs
 
 
 def check_out(out: Path, force: bool) -> None:
@@ -16,6 +20,45 @@ def check_out(out: Path, force: bool) -> None:
     """
     with told_of(out):
         _check(out, force)
+
+
+def check_space(out: Path) -> None:
+    """Raise `InputError` unless there is room for the files of a run at ``out``."""
+    with told_of(out):
+        parent = next(p for p in out.absolute().parents if p.exists())
+        free = shutil.disk_usage(parent).free
+    if free < SPACE_BYTES:
+        raise InputError.of(
+            "there is too little room on the disk for the results",
+            path="--out",
+            given=f"{free / 1e6:.0f} MB free at {out}",
+            allowed=f"at least {SPACE_BYTES / 1e6:.0f} MB",
+            suggestion="make room, or choose another folder with --out",
+        )
+
+
+def keep_elsewhere(write: Callable[[Path], int], whole: int, name: str) -> Path | None:
+    """A new folder in a temporary place with what ``write(folder)`` saves; None where nothing can be kept.
+
+    ``write`` says how many parts of ``whole`` it saved. The folder for temporary files, the user's own folder and the
+    memory are tried, those with room first, until one takes everything; the folder with most is kept.
+    """
+    places = [Path(tempfile.gettempdir()), Path("~").expanduser(), Path("/dev/shm")]
+    room = {place: shutil.disk_usage(place).free for place in places if place.is_dir()}
+    saved: dict[Path, int] = {}
+    for place in sorted(room, key=lambda place: room[place] < SPACE_BYTES):
+        try:
+            folder = Path(tempfile.mkdtemp(prefix=f"swarmsim-{name[:100]}-", dir=place))
+        except OSError:
+            continue
+        saved[folder] = write(folder)
+        if saved[folder] == whole:
+            break
+    best = max(saved, key=lambda folder: saved[folder], default=None)
+    for folder, count in saved.items():
+        if folder != best or count == 0:
+            shutil.rmtree(folder, ignore_errors=True)
+    return best if best is not None and saved[best] > 0 else None
 
 
 def told_of(out: Path) -> AbstractContextManager[None]:

@@ -4,11 +4,12 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 
+from swarmsim.atomic_folder import claimed
 from swarmsim.config.errors import raise_if_any
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.site_checks import check_site
 from swarmsim.results.extract import mission_record
-from swarmsim.results.out_folder import check_out
+from swarmsim.results.out_folder import check_out, check_space, told_of
 from swarmsim.results.record import MissionRecord
 from swarmsim.results.summary import Timings
 from swarmsim.runtime.progress import Progress, SilentProgress
@@ -32,10 +33,18 @@ def run(
 ) -> tuple[MissionRecord, ...]:
     """Fly ``missions`` missions (seeds N, N + 1, …) in one batch and write the run to ``out``, complete or not at all.
 
-    Raises `InputError` for a scenario that cannot be flown, and where ``out`` exists and ``force`` is not given.
+    Raises `InputError` for a scenario that cannot be flown, where ``out`` exists and ``force`` is not given, where
+    another run is being written there, and where there is too little room on the disk. When writing fails after the
+    flight, the results are kept in a temporary place, which the error tells.
     """
-    tell = progress or SilentProgress()
-    check_out(Path(out), force)
+    out = Path(out)
+    check_out(out, force)
+    check_space(out)
+    with told_of(out), claimed(out):
+        return _flown(scenario, out, missions, progress or SilentProgress(), force)
+
+
+def _flown(scenario: Scenario, out: Path, missions: int, tell: Progress, force: bool) -> tuple[MissionRecord, ...]:
     # Arrow, Matplotlib and Rerun, which write the run, take two seconds to import: meanwhile the mission flies.
     with ThreadPoolExecutor(1) as thread:
         writer = thread.submit(import_module, "swarmsim.results.run_directory")
@@ -45,7 +54,7 @@ def run(
         batch = simulation.rollout(range(first, first + missions), progress=tell)
         records = tuple(mission_record(simulation, batch, index) for index in range(missions))
         tell.phase("write", 0.0)
-        writer.result().write_run(simulation, records, out, timings_of(batch), force=force)
+        writer.result().write_run(simulation, records, out, timings_of(batch), force=force, keep=True)
     return records
 
 

@@ -1,24 +1,23 @@
 """A vehicle's body from a URDF or xacro file: mass, inertia, wheels and the mesh to draw.
 
-xacro is expanded by xacrodoc with the arguments of the specification, URDF is read by yourdfpy. Frames: the URDF's root
-link is taken as the body frame (x forward, y left, z up, as REP 103 has it), moved into the centre of mass.
+xacro is expanded by xacrodoc with the arguments of the specification, URDF is read by yourdfpy. Both read only what
+lies in the robot's folder (`swarmsim.vehicles.expansion.robot_folder`). Frames: the URDF's root link is taken as the
+body frame (x forward, y left, z up, as REP 103 has it), moved into the centre of mass.
 """
 
 import io
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
-from xml.parsers.expat import ExpatError
 
 import numpy as np
 import trimesh
 import yourdfpy
 from numpy.typing import NDArray
-from xacro import XacroException
-from xacrodoc import XacroDoc
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import BodyFile, Multirotor
+from swarmsim.vehicles.expansion import URDF_BYTES, expand, robot_folder
 from swarmsim.vehicles.rover_body import RoverBody, steiner
 
 Floats = NDArray[np.float64]
@@ -137,9 +136,12 @@ def with_file_body(spec: Multirotor) -> Multirotor:
 
 def _urdf_text(path: Path, args: dict[str, str | float | int | bool]) -> str:
     """URDF of the file, xacro expanded; an argument that the file does not declare is an error."""
+    if path.stat().st_size > URDF_BYTES:
+        raise InputError.of(f"is larger than {URDF_BYTES / 1e6:g} MB", file=path)
+    _refuse_entities(path.read_bytes(), path)
     try:
         tree = ElementTree.parse(path)
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise InputError.of(f"not well-formed XML: {error}", file=path) from error
     declared = {element.get("name", "") for element in tree.iter(f"{_XACRO}arg")}
     included = any(True for _ in tree.iter(f"{_XACRO}include"))
@@ -149,17 +151,26 @@ def _urdf_text(path: Path, args: dict[str, str | float | int | bool]) -> str:
         raise InputError.of(f"unknown xacro argument {', '.join(unknown)}", file=path, allowed=f"arguments: {known}")
     # xacrodoc hands the arguments on as text; xacro writes booleans in small letters.
     text = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in args.items()}
-    try:
-        return XacroDoc.from_file(str(path), subargs=text, walk_up=False).to_urdf_string()
-    except (XacroException, ExpatError, KeyError, ValueError, NameError, OSError) as error:
-        raise InputError.of(f"xacro cannot expand this file: {error}", file=path) from error
+    urdf = expand(path, text)
+    _refuse_entities(urdf.encode(), path)
+    return urdf
+
+
+def _refuse_entities(text: bytes, path: Path) -> None:
+    """Entities of XML can read other files and grow without end; robots need none."""
+    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:
+        raise InputError.of("declares a document type (DOCTYPE, ENTITY), which is not read", file=path)
 
 
 def _parse(text: str, path: Path) -> yourdfpy.URDF:
-    """The robot, its meshes loaded from beside the file."""
+    """The robot, its meshes loaded from the robot's folder."""
+    folder = robot_folder(path)
 
-    def local(name: str) -> str:
-        return str(path.parent / name.removeprefix("file://"))
+    def local(fname: str) -> str:  # yourdfpy gives it by this name
+        mesh = (path.parent / fname.removeprefix("file://")).resolve()
+        if not mesh.is_relative_to(folder):
+            raise InputError.of(f"names a mesh outside the robot's folder: {mesh}", file=path, allowed=f"in {folder}")
+        return str(mesh)
 
     try:
         return yourdfpy.URDF.load(io.BytesIO(text.encode()), filename_handler=local, load_meshes=True)

@@ -336,3 +336,14 @@ def test_an_impossible_place_for_the_results_is_told(
     fly(write_results)
     assert cli.main(["run", "recon", "--out", "x" * 300]) == 2
     assert "cannot be written there (File name too long)" in capsys.readouterr().err
+
+
+def test_a_working_folder_that_is_gone_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    assert cli.main(["list"]) == 2
+    assert "working folder cannot be used (No such file" in capsys.readouterr().err

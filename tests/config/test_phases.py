@@ -31,7 +31,7 @@ EDITS = {
     "no time limit": (
         "    start: {after: survey}\n    time_limit_s: 600.0\n",
         "    start: {after: survey}\n",
-        ["phases.1.time_limit_s: this field is missing", "greater than 0"],
+        ["phases.1.time_limit_s: this field is missing", "from 0.001 to 86400"],
     ),
     "no time": ("time_limit_s: 600.0", "time_limit_s: 0", ["phases.0.time_limit_s: is too small"]),
     "settings in a list": (SEARCH, "[1]", ["phases.1.settings: is not a mapping", "given:   [1]"]),
@@ -43,7 +43,7 @@ EDITS = {
     "setting missing": (
         "    settings: {speed_m_s: 0.9, standoff_m: 4.0, viewpoints: 8}\n",
         "",
-        ["@- name: search", "phases.1.settings.speed_m_s: this field is missing", "at most 5"],
+        ["@- name: search", "phases.1.settings.speed_m_s: this field is missing", "to 5"],
     ),
     "setting too large": ("viewpoints: 8", "viewpoints: 800", ["settings.viewpoints: is too large", "1 to 64"]),
     "setting of another policy": (
@@ -91,7 +91,7 @@ EDITS = {
     ),
     "two starts": ("{after: survey}", "{after: survey, at_s: 3}", ["phases.1.start: give exactly one of at_s"]),
     "delay alone": ("{after: survey}", "{delay_s: 3}", ["phases.1.start: give exactly one of at_s"]),
-    "start in the past": ("{after: survey}", "{at_s: -3}", ["phases.1.start.at_s: is too small", "at least 0"]),
+    "start in the past": ("{after: survey}", "{at_s: -3}", ["phases.1.start.at_s: is too small", "from 0 to"]),
     "start as a word": ("{after: survey}", "survey", ["phases.1.start: is not a mapping", "at_s, after, when"]),
     "unknown finding": ("{after: survey}", "{when: hotspt}", ["phases.1.start.when", "hotspot"]),
     "end before the start": (

@@ -108,7 +108,7 @@ def test_new_files_are_found_without_code(library: Library, tmp_path: Path, monk
     [
         ("{H: 0.0221", "{Hh: 0.0221", "no element Hh"),
         ("{H: 0.0221", "{H: 0.221", "add up to"),
-        ("{H: 0.0221", "{H: -0.0221", "above 0"),
+        ("{H: 0.0221", "{H: -0.0221", "composition.H"),
         ("density_kg_m3: 2300", "density_kg_m3: -1", "density_kg_m3"),
     ],
 )
