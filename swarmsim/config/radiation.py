@@ -39,11 +39,23 @@ class BuildUp(Model):
     p: float = Field(default=0.0, gt=-3, lt=3)
 
 
+class NamedAs(Model):
+    """Words in the names of a mesh by which `swarmsim import-site` guesses a material, and its usual thickness.
+
+    A word is compared with each word of a name, as its beginning if it has four letters or more. ``wall_m`` is the
+    thickness of the shell or sheet that such a name stands for; a thing without it is solid.
+    """
+
+    words: tuple[str, ...] = Field(min_length=1)
+    wall_m: Positive | None = None
+
+
 class Material(Model):
     """A material (``configs/materials/<name>.yaml``): bulk density and mass attenuation against energy.
 
-    An energy written twice is an absorption edge: the first value holds below it, the second above. The last two
-    fields are needed only to derive ``build_up`` with ``configs/materials/generate_build_up.py`` of the repository.
+    An energy written twice is an absorption edge: the first value holds below it, the second above.
+    ``mass_energy_absorption_cm2_g`` and ``electrons_mol_g`` are only needed to derive ``build_up`` with
+    ``configs/materials/generate_build_up.py`` of the repository.
     """
 
     name: Name
@@ -54,6 +66,7 @@ class Material(Model):
     source: str
     mass_energy_absorption_cm2_g: tuple[Positive, ...] | None = None
     electrons_mol_g: float | None = Field(default=None, gt=0, le=1)
+    named_as: tuple[NamedAs, ...] = ()
 
     @model_validator(mode="after")
     def _aligned(self) -> "Material":
