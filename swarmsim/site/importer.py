@@ -28,6 +28,7 @@ from swarmsim.site.visual import visual_mesh
 Mask = NDArray[np.bool_]
 
 CELLS_MAX = 4_000_000
+FLUSH_M = 0.02  # what rises no further above the ground does not stand on it
 COARSE_M = 0.3  # cells of the raster of clearances that a user is told of
 BARE_SHARE = 0.05  # of a site that is traversable: below it there is hardly any ground
 PLANE = "level ground"  # name of the part that `SiteSpec.plane` adds
@@ -249,11 +250,11 @@ def _separate(parts: list[Part], corners: Floats, grid: Grid, spec: SiteSpec, pa
 
 
 def _buried(grid: Grid, ground: Floats, corners: Floats) -> Mask:
-    """Triangles [t] that lie wholly below the ``ground`` [ny, nx], such as slabs and foundations."""
+    """Triangles [t] that lie wholly below the ``ground`` [ny, nx] or flush with it, such as slabs and foundations."""
     lowest_near = ndimage.minimum_filter(ground, 3, mode="nearest").ravel()
-    below = (corners[..., 2] < lowest_near[grid.cell_of(corners[..., :2])] - THICKNESS).all(axis=1)
+    below = (corners[..., 2] < lowest_near[grid.cell_of(corners[..., :2])] + FLUSH_M).all(axis=1)
     hits = faces_on(grid, corners[below])
-    above = hits.height > ground.ravel()[hits.cell] - THICKNESS
+    above = hits.height > ground.ravel()[hits.cell] + FLUSH_M
     index = np.flatnonzero(below)
     below[index[np.unique(hits.triangle[above])]] = False
     return below

@@ -221,9 +221,15 @@ def _parts_of(scene: Any) -> RawMesh:
 
 
 def _colours(mesh: Any) -> Bytes:
-    if mesh.visual.kind is None:
+    visual = mesh.visual
+    if visual.kind is None:
         return np.tile(np.array(NO_COLOUR, np.uint8), (len(mesh.faces), 1))
-    colours = mesh.visual.to_color() if mesh.visual.kind == "texture" else mesh.visual
-    if colours.kind == "vertex":
-        return np.asarray(colours.vertex_colors)[mesh.faces].mean(axis=1).astype(np.uint8)
-    return np.asarray(colours.face_colors, np.uint8)
+    if visual.kind == "texture":
+        material = visual.material
+        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+        if visual.uv is None or image is None or len(visual.uv) != len(mesh.vertices):
+            return np.tile(np.asarray(material.main_color, np.uint8), (len(mesh.faces), 1))
+        visual = visual.to_color()
+    if visual.kind == "vertex":
+        return np.asarray(visual.vertex_colors)[mesh.faces].mean(axis=1).astype(np.uint8)
+    return np.asarray(visual.face_colors, np.uint8)
