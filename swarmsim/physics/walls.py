@@ -29,7 +29,7 @@ _ROUND = (0, 1, 3, 2)  # front left, front right, rear right, rear left: the cor
 
 @pytree
 class OutlineContacts:
-    """Points of the outline that can touch a wall: the ends of the pieces of its sides and the nearest point of each."""
+    """Points of the outline that can touch a wall: the ends of the pieces of its sides, the nearest point of each."""
 
     clearance_m: jax.Array  # [C] distance to the wall along its normal, < 0 in the wall; C = 8 PIECES
     outward: jax.Array  # [C, 2] unit, world: out of the wall
