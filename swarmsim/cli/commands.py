@@ -234,10 +234,14 @@ def import_site(
     out: Path,
     name: str | None = None,
     unit: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
+    height_unit: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
     up: Literal["X", "Y", "Z"] | None = None,
     cell: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
     ground: Annotated[tuple[str, ...], Parameter(consume_multiple=False)] = (),
+    plane: Annotated[float | None, Parameter(validator=Number(gt=0, lte=500))] = None,
     licence: str | None = None,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    guess: Annotated[bool, Parameter(negative="--no-guess")] = True,
     force: bool = False,
 ) -> None:
     """Turn a mesh (.dae, .obj, .glb, .stl) or an elevation model (GeoTIFF) into a site.
@@ -247,6 +251,8 @@ def import_site(
         swarmsim import-site yard.obj --out configs/sites/yard --unit 0.01 --up Y
         swarmsim import-site yard.glb --out configs/sites/yard --ground 'terrain*'
         swarmsim import-site alps.tif --out configs/sites/alps --cell 2
+        swarmsim import-site house.dae --out configs/sites/house --plane 20
+        swarmsim import-site scan.obj --out configs/sites/scan --set holes_max=0.3 --set default_material=brick
 
     Parameters
     ----------
@@ -258,20 +264,35 @@ def import_site(
         Name of the site.
     unit
         Metres of one unit of the file, where the file does not say or is wrong.
+    height_unit
+        Metres of one unit of the heights of an elevation model, where they differ from the file's or it does not say.
     up
         The axis of the file that points up, where the file does not say or is wrong.
     cell
         Size of the cells of the height maps, in metres.
     ground
         Pattern of the materials or geometries that are bare ground; may be given again and again.
+    plane
+        Lay level ground at height 0 under a model that has none, such as a building, and this far around it, in metres.
     licence
         Licence of the file, to be written into the site.
+    overrides
+        Any other field of site.yaml, as field=value (see 'swarmsim schema site'); may be given again and again.
+    guess
+        Guess materials from the names in the mesh (the default) and write them to site.yaml; --no-guess leaves it.
     force
         Replace an existing site.
     """
-    from swarmsim.cli.files import import_site_file
+    from swarmsim.cli.sites import import_site_file
 
-    import_site_file(file, out, name, unit, up, cell, ground, licence, force)
+    given = {
+        "unit_m": unit,
+        "height_unit_m": height_unit,
+        "up_axis": up,
+        "ground": list(ground) or None,
+        "plane": None if plane is None else {"margin_m": plane},
+    }
+    import_site_file(file, out, given, overrides, name, cell, licence, guess, force)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

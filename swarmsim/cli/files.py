@@ -9,10 +9,10 @@ from typing import Any
 
 from pydantic import TypeAdapter
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from swarmsim.atomic_folder import atomic_folder
-from swarmsim.cli.run import value_text
 from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS
@@ -35,17 +35,19 @@ def check_files(paths: Sequence[Path]) -> None:
             continue
         for file in found:
             try:
-                kind = check_file(file)
+                kind, warnings = check_file(file)
             except InputError as error:
                 problems += [problem for problem in error.problems if problem not in problems]
             else:
                 sys.stdout.write(f"ok  {shown_path(file)} ({kind.removesuffix('s')})\n")
+                sys.stdout.writelines(f"    warning: {warning}\n" for warning in warnings)
     raise_if_any(problems)
 
 
-def check_file(path: Path) -> str:
-    """Validate one file with all that it refers to; its kind. Raises `InputError`."""
+def check_file(path: Path) -> tuple[str, list[str]]:
+    """Validate one file with all that it refers to; its kind, and warnings of it. Raises `InputError`."""
     kind = kind_of_file(path)
+    warnings: list[str] = []
     if kind == "missions":
         from swarmsim.config.scenario import load_scenario
         from swarmsim.config.site_checks import check_site
@@ -55,10 +57,10 @@ def check_file(path: Path) -> str:
         load_named(kind, path)
         from swarmsim.site import load_site
 
-        load_site(path, tuple(load_all("materials", path)))
+        warnings = load_site(path, tuple(load_all("materials", path))).report["warnings"]
     else:
         load_named(kind, path)
-    return kind
+    return kind, warnings
 
 
 def kind_of_file(path: Path) -> str:
@@ -102,7 +104,7 @@ def list_available(kind: str | None) -> None:
     for one in (*files.KINDS, "policies") if kind is None else (kind,):
         table = Table("name", "what", "file", title=one, title_justify="left", title_style="bold")
         for row in _policy_rows() if one == "policies" else _file_rows(one):
-            table.add_row(*row)
+            table.add_row(*map(escape, row))
         console.print(table)
 
 
@@ -157,47 +159,3 @@ def _check_new(target: Path) -> None:
         )
     if target.parent.exists() and not target.parent.is_dir():
         raise InputError.of("is a file, not a folder", file=str(target.parent))
-
-
-def import_site_file(
-    file: Path,
-    out: Path,
-    name: str | None,
-    unit_m: float | None,
-    up_axis: str | None,
-    cell_m: float | None,
-    ground: tuple[str, ...],
-    licence: str | None,
-    force: bool,
-) -> None:
-    """Import a mesh or an elevation model as a site and say what was found in it."""
-    if out.exists() and not force:
-        raise InputError.of(
-            "there is something already",
-            path="--out",
-            given=str(out),
-            suggestion="choose another folder, or replace the site with --force",
-        )
-    given = {"unit_m": unit_m, "up_axis": up_axis, "ground": list(ground) or None}
-    fields = {key: value for key, value in given.items() if value is not None}
-
-    from swarmsim.site import ImportOptions, import_site
-
-    options = ImportOptions(
-        name=name, cell_m=cell_m, fields=fields, overwrite=force, licence=licence or ImportOptions.licence
-    )
-    model = import_site(file, out, options)
-    table = Table("what", "value", title=f"site {model.name}", title_justify="left")
-    for key, value in model.report.items():
-        table.add_row(key, _parts(value) if key == "parts" else value_text(value))
-    console = Console()
-    console.print(table)
-    console.print(f"Site: {out}", highlight=False, soft_wrap=True)
-
-
-def _parts(parts: list[dict[str, Any]]) -> str:
-    """What the parts of a mesh were taken for: one line for each material, with the names of its parts."""
-    names: dict[str, dict[str, None]] = {}
-    for part in parts:
-        names.setdefault(part["is"], {})[part["names"][0]] = None
-    return "\n".join(f"{what}: {', '.join(found)}" for what, found in names.items())

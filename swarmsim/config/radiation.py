@@ -41,6 +41,17 @@ class Nuclide(Model):
     source: str
 
 
+class NamedAs(Model):
+    """Words in the names of a mesh by which `swarmsim import-site` guesses a material, and its usual thickness.
+
+    A word is compared with each word of a name, as its beginning if it has four letters or more. ``wall_m`` is the
+    thickness of the shell or sheet that such a name stands for; a thing without it is solid.
+    """
+
+    words: tuple[str, ...] = Field(min_length=1, max_length=100)
+    wall_m: float | None = Field(default=None, ge=1e-5, le=10)
+
+
 class Material(Model):
     """A material (``configs/materials/<name>.yaml``): bulk density and composition by mass.
 
@@ -51,6 +62,7 @@ class Material(Model):
     density_kg_m3: float = Field(ge=1e-3, le=30_000)
     composition: dict[str, MassFraction] = Field(min_length=1, max_length=40)
     source: str
+    named_as: tuple[NamedAs, ...] = Field(default=(), max_length=100)
 
     @property
     def mass_fractions(self) -> dict[str, float]:

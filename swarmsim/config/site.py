@@ -40,6 +40,16 @@ class Traversability(Model):
     obstacle_weight: NonNegative = 2.0
 
 
+class Plane(Model):
+    """Level ground laid under a model that brings none, such as a building.
+
+    It reaches ``margin_m`` beyond the model on every side and lies at ``height_m`` in the file's coordinates, in m.
+    """
+
+    margin_m: float = Field(default=20.0, gt=0, le=500)
+    height_m: float = Field(default=0.0, ge=-10_000, le=10_000)
+
+
 class Zone(Model):
     """A polygon that the rover must not enter."""
 
@@ -50,10 +60,12 @@ class Zone(Model):
 class SiteSpec(Model):
     """A site: its source file and how to read it.
 
-    ``unit_m`` and ``up_axis`` override what the file says of itself. ``ground`` are patterns of the mesh materials or
-    geometries that are bare ground; without them the ground is told from the shape. ``extent_m`` is what the longer
-    side of a mesh may measure, a guard against wrong units; ``holes_max`` is the fraction of the ground that may be
-    missing and is then filled by interpolation.
+    ``unit_m`` and ``up_axis`` override what the file says of itself; ``height_unit_m`` is the unit of the heights of an
+    elevation model, where it differs. ``ground`` are patterns of the mesh materials or geometries that are bare ground;
+    without them the ground is told from the shape; ``plane`` lays level ground under a model that has none.
+    ``extent_m`` is what the longer side of a mesh may measure, a guard against wrong units; ``holes_max`` is the
+    fraction of the ground that may be missing and is then filled by interpolation. Obstacles that no rule of
+    ``obstacles`` matches are of ``default_material``: shells of ``default_wall_m``, or solid without it.
     """
 
     name: Name
@@ -61,15 +73,18 @@ class SiteSpec(Model):
     file: str = Field(min_length=1)
     licence: str
     unit_m: Positive | None = None
+    height_unit_m: Positive | None = None
     up_axis: Literal["X", "Y", "Z"] | None = None
     cell_m: Positive
     extent_m: tuple[Positive, Positive] = (10.0, 1000.0)
-    holes_max: Fraction = 0.05
+    holes_max: Fraction = 0.15
     max_file_mb: Positive = 100.0
     ground: tuple[str, ...] = ()
+    plane: Plane | None = None
     ground_material: Name = "soil"
     obstacles: tuple[ObstacleMaterial, ...] = ()
     default_material: Name = "concrete"
+    default_wall_m: Positive | None = None
     zones: tuple[Zone, ...] = ()
     survey_area_m: ConvexPolygon | None = None
     traversability: Traversability = Traversability()

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 OVERHEAD_M = 0.4  # a surface this far above the terrain is an obstacle to a UAV, not ground
+OUTLINE_POINTS = 12  # along each side of a rover
 POROUS_KG_M3 = 100.0  # a thing of a lower bulk density is foliage or straw: a source can lie in it
 
 
@@ -46,7 +47,7 @@ class _Ground:
         self.cell = float(site.cell_m)
         self.terrain = np.asarray(site.terrain_m, float)
         self.surface = np.asarray(site.surface_m, float)
-        self.clearance = np.asarray(site.clearance_m, float)
+        self.site = site
         self.low = np.asarray(site.origin_m, float) - self.cell / 2
         self.high = self.low + self.cell * np.array(self.terrain.shape[::-1])
         self.area = np.asarray(site.survey_area_m, float)
@@ -81,6 +82,14 @@ class _Ground:
         (left, low), (right, high) = np.clip(((corners - self.low) / self.cell).astype(int), 0, [columns - 1, rows - 1])
         window = np.s_[low : high + 1, left : right + 1]
         return float(np.max(self.surface[window] - self.terrain[window]))
+
+    def least_clearance(self, xy: Floats) -> float:
+        """Least clearance of a rover at points [p, 2], bilinear as the bumpers have it."""
+        import jax.numpy as jnp
+
+        from swarmsim.site import sample
+
+        return float(np.min(np.asarray(sample(self.site.clearance_m, self.site, jnp.asarray(xy, jnp.float32)))))
 
     def depth(self, point: Floats) -> Floats:
         """How deep a point [3] lies within each box, along the box's own axes [K, 3]; < 0 outside."""
@@ -154,11 +163,26 @@ def _start_fault(scenario: Scenario, ground: _Ground, i: int) -> tuple[str, dict
         return "below something that stands there, such as a tree or a roof", {
             "allowed": f"a place with nothing above the ground within {radius:.2f} m"
         }
-    if isinstance(vehicle, SkidSteer) and ground.cell_value(ground.clearance, xy) <= 0:
+    if isinstance(vehicle, SkidSteer) and ground.least_clearance(_outline(scenario, i)) <= 0:
         return "where a rover cannot drive (obstacle, closed zone or edge of the site)", {
             "allowed": "traversable ground"
         }
     return None
+
+
+def _outline(scenario: Scenario, i: int) -> Floats:
+    """Points [p, 2] (m, ENU) along the outline of a rover at its start, and its centre: what its bumpers sense."""
+    from swarmsim.vehicles.rover_body import rover_body
+
+    vehicle, member = scenario.vehicles[i], scenario.members[i]
+    assert isinstance(vehicle, SkidSteer)
+    rear, front, right, left = rover_body(vehicle).outline_m
+    share = np.linspace(0.0, 1.0, OUTLINE_POINTS)
+    x, y = rear + share * (front - rear), right + share * (left - right)
+    sides = [(x, 0 * x + right), (x, 0 * x + left), (0 * y + rear, y), (0 * y + front, y), (np.zeros(1), np.zeros(1))]
+    own = np.concatenate([np.stack(side, axis=-1) for side in sides])
+    cos, sin = math.cos(math.radians(member.heading_deg)), math.sin(math.radians(member.heading_deg))
+    return own @ np.array([[cos, sin], [-sin, cos]]) + np.array(member.position_m)
 
 
 def _check_areas(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:

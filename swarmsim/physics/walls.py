@@ -17,41 +17,42 @@ from swarmsim.vehicles.skid_steer import SkidSteerParams
 from swarmsim.vehicles.state import RigidState, SkidSteerState
 
 SWEEPS = 8
-PROBES = 2  # for the nearest point of a side
-NOT_NEAR_M = 1e3  # clearance of a side whose nearest point is one of its ends
+PIECES = 2  # of each side, so that one between the ends of two fences touches both
+PROBES = 2  # for the nearest point of a piece
+NOT_NEAR_M = 1e3  # clearance of a piece whose nearest point is one of its ends
 STEEPNESS_MIN = 0.3  # of the interpolated clearance, which is 1 but for the raster
 REACH_M_S = 0.5  # contacts that need more change of speed than this to be touched do not share the impulses
 RECOVERY = 0.2  # share of a penetration that one step takes back
 RECOVERY_MAX_M_S = 0.2
-_NEXT = (1, 3, 0, 2)  # corner that follows each of front left, front right, rear left, rear right round the outline
+_ROUND = (0, 1, 3, 2)  # front left, front right, rear right, rear left: the corners in their order round the outline
 
 
 @pytree
 class OutlineContacts:
-    """Points of the outline that can touch a wall: the four corners and the nearest point of each of the four sides."""
+    """Points of the outline that can touch a wall: the ends of the pieces of its sides, the nearest point of each."""
 
-    clearance_m: jax.Array  # [8] distance to the wall along its normal, < 0 in the wall
-    outward: jax.Array  # [8, 2] unit, world: out of the wall
-    arm_m: jax.Array  # [8, 2] world, from the centre of mass
+    clearance_m: jax.Array  # [C] distance to the wall along its normal, < 0 in the wall; C = 8 PIECES
+    outward: jax.Array  # [C, 2] unit, world: out of the wall
+    arm_m: jax.Array  # [C, 2] world, from the centre of mass
 
 
 def near_walls(params: SkidSteerParams, body: RigidState, rotation: jax.Array, site: Site) -> OutlineContacts:
     """Contacts of the outline; ``rotation`` [3, 3]: body to world.
 
-    The clearance along a side is convex where the wall is, so its least value is sought where tangents meet
+    The clearance along a piece of a side is convex where the wall is, so its least value is sought where tangents meet
     (cutting planes). Where the convex corner of a wall touches a side, the direction of contact is that side's normal.
     """
-    corner = jnp.sum(rotation[:2, :2] * params.corner_m[:, None, :], axis=-1)
-    clearance, gradient = sample_with_gradient(site.clearance_m, site, body.position_m[:2] + corner)
-    order = jnp.array(_NEXT)
-    side = corner[order] - corner
-    slope = jnp.sum(gradient * side, axis=-1), jnp.sum(gradient[order] * side, axis=-1)
-    low, high = jnp.zeros(4), jnp.ones(4)
-    value = clearance, clearance[order]
+    corner = jnp.sum(rotation[:2, :2] * params.corner_m[:, None, :], axis=-1)[jnp.array(_ROUND)]
+    side = jnp.repeat((jnp.roll(corner, -1, axis=0) - corner) / PIECES, PIECES, axis=0)
+    ends = jnp.repeat(corner, PIECES, axis=0) + (jnp.arange(4 * PIECES) % PIECES)[:, None] * side
+    clearance, gradient = sample_with_gradient(site.clearance_m, site, body.position_m[:2] + ends)
+    slope = jnp.sum(gradient * side, axis=-1), jnp.sum(jnp.roll(gradient, -1, axis=0) * side, axis=-1)
+    low, high = jnp.zeros(len(ends)), jnp.ones(len(ends))
+    value = clearance, jnp.roll(clearance, -1)
     within = (slope[0] < 0.0) & (slope[1] > 0.0)
     for _ in range(PROBES):
         place = _where_tangents_meet(low, high, value, slope)
-        arm = corner + jax.lax.stop_gradient(place)[:, None] * side
+        arm = ends + jax.lax.stop_gradient(place)[:, None] * side
         between, normal = sample_with_gradient(site.clearance_m, site, body.position_m[:2] + arm)
         along = jnp.sum(normal * side, axis=-1)
         falls = along < 0.0  # the least value lies beyond
@@ -63,14 +64,14 @@ def near_walls(params: SkidSteerParams, body: RigidState, rotation: jax.Array, s
     return OutlineContacts(
         clearance_m=jnp.concatenate([clearance / steepness, jnp.where(within, between, NOT_NEAR_M)]),
         outward=normal * jax.lax.rsqrt(jnp.sum(normal * normal, axis=-1, keepdims=True) + 1e-12),
-        arm_m=jnp.concatenate([corner, arm]),
+        arm_m=jnp.concatenate([ends, arm]),
     )
 
 
 def _where_tangents_meet(
     low: jax.Array, high: jax.Array, value: tuple[jax.Array, jax.Array], slope: tuple[jax.Array, jax.Array]
 ) -> jax.Array:
-    """Place [4] between ``low`` and ``high`` [4] where the tangents at both meet; the middle if they do not."""
+    """Place [P] between ``low`` and ``high`` [P] where the tangents at both meet; the middle if they do not."""
     bend = slope[1] - slope[0]
     convex = bend > 1e-3
     meet = (slope[1] * high - slope[0] * low - value[1] + value[0]) / jnp.where(convex, bend, 1.0)

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 from swarmsim.config.vehicles import SkidSteer
 from swarmsim.policies.path import Path, limit_speed, resample
 from swarmsim.policies.protocol import Assignment
-from swarmsim.policies.routes import coarsen, passable, smooth
+from swarmsim.policies.routes import (
+    at_centres,
+    coarsen,
+    line_clearance,
+    move_clearance,
+    move_costs,
+    passable,
+    smooth,
+)
 from swarmsim.pytree import on_host, pytree
 from swarmsim.site import Site, sample
 
@@ -18,14 +26,21 @@ ROUTE_POINTS = 1536
 ROVER_MARGIN_M = 0.3  # kept beside the rover's half width
 SMOOTHING_M = 1.0  # half width of the moving average that rounds the grid's corners
 CORNER_M = 0.3  # how far the rover may cut a corner
-START_COST = 10.0  # a rover that starts beside an obstacle may leave its cell at this cost per metre
+ENTRY_CELLS = 2  # a route begins and ends at a cell at most this many away …
+ENTRY_SAMPLES = 12  # … to which the straight line is clear, as told by this many points of it
+NEARER_M = 0.05  # how much nearer to an obstacle than where it stands that line may lead
+CLEAR_MIN_M = 0.05  # of that line, in any case
+CUT_M = 0.15  # of the margin that rounding the corners may take up
 
 
 @dataclass(frozen=True)
 class RouteGrid:
-    """The cost that routes are planned on, for one rover."""
+    """The cells that routes are planned on, for one rover."""
 
-    cost: jax.Array  # [ny, nx] per metre, inf where the rover does not fit
+    site: Site
+    radius_m: jax.Array  # [] clearance that the rover needs
+    cost: jax.Array  # [ny, nx] per metre, inf where no wheel can stand
+    moves: jax.Array  # [16, ny, nx] cost of each move, inf where the rover does not fit
     origin_m: jax.Array  # [2] centre of cell [0, 0], world
     cell_m: jax.Array  # []
 
@@ -37,6 +52,26 @@ class RouteGrid:
     def place(self, cells: jax.Array) -> jax.Array:
         """Centres [..., 2] of cells [..., 2] (row, column)."""
         return self.origin_m + self.cell_m * cells[..., ::-1].astype(jnp.float32)
+
+    def entry(self, xy: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Where a route that begins or ends at ``xy`` [2] joins the grid: a cell [2], and whether [] there is one.
+
+        It is the nearest cell where the rover fits, with a straight way there that leads no nearer to obstacles than
+        ``xy`` is; the nearest cell of all where there is none.
+        """
+        nearest = self.cell_of(xy)
+        span = jnp.arange(-ENTRY_CELLS, ENTRY_CELLS + 1)
+        around = nearest + jnp.stack(jnp.meshgrid(span, span, indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = jnp.all((around >= 0) & (around < jnp.array(self.cost.shape)), axis=-1)
+        around = jnp.clip(around, 0, jnp.array(self.cost.shape) - 1)
+        centre = self.place(around)
+        wanted = jnp.minimum(self.radius_m, sample(self.site.clearance_m, self.site, xy) - NEARER_M)
+        way = line_clearance(self.site, jnp.broadcast_to(xy, centre.shape), centre, ENTRY_SAMPLES)
+        leaves = jnp.any(jnp.isfinite(self.moves[:, around[:, 0], around[:, 1]]), axis=0)
+        good = inside & leaves & (way >= jnp.maximum(wanted, CLEAR_MIN_M))
+        apart = jnp.where(good, jnp.sum((centre - xy) ** 2, axis=-1), jnp.inf)
+        best = jnp.argmin(apart)
+        return jnp.where(good[best], around[best], nearest), good[best]
 
 
 def planning_cells(site: Site) -> tuple[int, float]:
@@ -68,26 +103,33 @@ def rover_limits(assignment: Assignment) -> RoverLimits:
     )
 
 
-def route_grid(site: Site, limits: RoverLimits, block: int, start_m: jax.Array) -> RouteGrid:
-    """The grid for one rover with its ``limits`` that stands at ``start_m`` [2]; its own cell is always open.
+def route_grid(site: Site, limits: RoverLimits, block: int) -> RouteGrid:
+    """The grid for one rover with its ``limits``.
 
-    It keeps clear of slopes and steps that are too much for the site's rules (`swarmsim.config.site.Traversability`) or
-    for the rover.
+    It keeps clear of obstacles by the rover's width and a margin, and of slopes and steps that are too much for the
+    site's rules (`swarmsim.config.site.Traversability`) or for the rover.
     """
     cost = jnp.where(passable(site, limits.slope_max, limits.step_max_m), site.cost, jnp.inf)
-    cost = coarsen(cost, site.clearance_m, limits.radius_m, block)
-    grid = RouteGrid(cost=cost, origin_m=site.origin_m + 0.5 * (block - 1) * site.cell_m, cell_m=site.cell_m * block)
-    start = grid.cell_of(start_m)
-    return RouteGrid(cost=cost.at[start[0], start[1]].min(START_COST), origin_m=grid.origin_m, cell_m=grid.cell_m)
+    cost = coarsen(cost, at_centres(site.clearance_m, site.terrain_m.shape), block)
+    origin, cell = site.origin_m + 0.5 * (block - 1) * site.cell_m, site.cell_m * block
+    rows, columns = cost.shape
+    east, north = jnp.meshgrid(jnp.arange(columns), jnp.arange(rows))
+    centre = origin + cell * jnp.stack([east, north], axis=-1)
+    fine_cells = block * max(1, site.clearance_m.shape[0] // site.terrain_m.shape[0])
+    fits = move_clearance(site, centre, cell, fine_cells) >= limits.radius_m
+    return RouteGrid(site, limits.radius_m, cost, move_costs(cost, fits, cell), origin, cell)
 
 
-def ground_path(
-    site: Site, corners_m: jax.Array, speed_m_s: jax.Array, acceleration_m_s2: jax.Array, points: int
-) -> Path:
-    """Round the grid's corners [W, 2], set the speeds and lay the path on the terrain."""
+def ground_path(site: Site, corners_m: jax.Array, speed_m_s: jax.Array, limits: RoverLimits, points: int) -> Path:
+    """Round the grid's corners [W, 2] where one rover has room for it, set the speeds, lay the path on the terrain."""
     flat, length = resample(corners_m, points)
     half_width = (SMOOTHING_M * (points - 1) / jnp.maximum(length, 1.0)).astype(jnp.int32)
-    flat, length = resample(smooth(flat, half_width), points)
+    wanted = jnp.minimum(limits.radius_m, sample(site.clearance_m, site, flat)) - CUT_M
+    rounded = flat
+    for share in (4, 2, 1):  # the widest rounding that keeps clear
+        wider = smooth(flat, half_width // share)
+        rounded = jnp.where((sample(site.clearance_m, site, wider) >= wanted)[:, None], wider, rounded)
+    flat, length = resample(rounded, points)
     places = jnp.concatenate([flat, sample(site.terrain_m, site, flat)[:, None]], axis=-1)
-    speed = limit_speed(places, jnp.full(points, speed_m_s), acceleration_m_s2, CORNER_M)
+    speed = limit_speed(places, jnp.full(points, speed_m_s), limits.acceleration_m_s2, CORNER_M)
     return Path(points_m=places, speed_m_s=speed, spacing_m=length / (points - 1), length_m=length)

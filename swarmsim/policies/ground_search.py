@@ -18,7 +18,7 @@ from swarmsim.policies.ground_path import (
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Assignment, Situation
 from swarmsim.policies.registry import register
-from swarmsim.policies.routes import cost_to_go, descend
+from swarmsim.policies.routes import MOVES, cost_to_go, descend
 from swarmsim.pytree import on_host, pytree, static
 from swarmsim.site import Site
 
@@ -72,15 +72,17 @@ class ApproachAndOrbit:
         """
 
         def one(position: jax.Array, limits: RoverLimits) -> Path:
-            grid = route_grid(site, limits, task.block, position[:2])
+            grid = route_grid(site, limits, task.block)
+            start, enters = grid.entry(position[:2])
             target = grid.cell_of(situation.target_m)
-            from_start = cost_to_go(grid.cost, grid.cell_of(position[:2]), grid.cell_m)
+            from_start = cost_to_go(grid.moves, start)
             views, reachable = _viewpoints(task, situation.target_m, from_start, grid.cell_of)
-            first, legs, any_leg = _tour(task, grid.cost, from_start, views, reachable, target, grid.cell_m)
-            approach = descend(from_start, grid.cost, first, grid.cell_m, 2 * sum(grid.cost.shape))[::-1]
-            xy = grid.place(jnp.concatenate([approach, legs.reshape(-1, 2)])).at[0].set(position[:2])
-            xy = jnp.where(any_leg & situation.found, xy, position[:2])
-            return ground_path(site, xy, task.speed_m_s, limits.acceleration_m_s2, task.points)
+            first, legs, any_leg = _tour(task, grid.moves, from_start, views, reachable, target)
+            approach = descend(from_start, grid.moves, first, 2 * sum(grid.cost.shape))[::-1]
+            cells = grid.place(jnp.concatenate([approach, legs.reshape(-1, 2)]))
+            xy = jnp.concatenate([position[None, :2], cells])
+            xy = jnp.where(any_leg & enters & situation.found, xy, position[:2])
+            return ground_path(site, xy, task.speed_m_s, limits, task.points)
 
         return jax.vmap(one)(situation.position_m, task.limits)
 
@@ -100,12 +102,11 @@ def _viewpoints(
 
 def _tour(
     task: SearchTask,
-    cost: jax.Array,
+    moves: jax.Array,
     from_start: jax.Array,
     views: jax.Array,
     reachable: jax.Array,
     target: jax.Array,
-    cell: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """First viewpoint [2], the cells [n laps - 1, steps, 2] of the legs between viewpoints, and whether there is any.
 
@@ -113,11 +114,12 @@ def _tour(
     """
     n = task.viewpoints
     first = jnp.argmin(jnp.where(reachable, from_start[views[:, 0], views[:, 1]], jnp.inf))
-    size = tuple(min(2 * task.window + 1, extent) for extent in cost.shape)
-    corner = jnp.clip(target - task.window, 0, jnp.array(cost.shape) - jnp.array(size))
-    local = jax.lax.dynamic_slice(cost, (corner[0], corner[1]), size)
+    shape = moves.shape[1:]
+    size = tuple(min(2 * task.window + 1, extent) for extent in shape)
+    corner = jnp.clip(target - task.window, 0, jnp.array(shape) - jnp.array(size))
+    local = _window(moves, corner, size)
     within = jnp.clip(views - corner, 0, jnp.array(size) - 1)
-    fields = jax.vmap(lambda goal: cost_to_go(local, goal, cell))(within)
+    fields = jax.vmap(lambda goal: cost_to_go(local, goal))(within)
     linked = reachable & jnp.isfinite(fields[first, within[:, 0], within[:, 1]])
     # in their order round the target from the first one, as often as there are laps; then the last one repeats
     turn = jnp.where(linked, (jnp.arange(n) - first) % n, n)
@@ -127,7 +129,14 @@ def _tour(
     steps = sum(size)
 
     def leg(source: jax.Array, goal: jax.Array) -> jax.Array:
-        return corner + descend(fields[goal], local, within[source], cell, steps)
+        return corner + descend(fields[goal], local, within[source], steps)
 
     legs = jax.vmap(leg)(order[:-1], order[1:]) if len(order) > 1 else views[order][None]
     return views[first], legs, jnp.any(reachable)
+
+
+def _window(moves: jax.Array, corner: jax.Array, size: tuple[int, ...]) -> jax.Array:
+    """The cells [16, *size] from ``corner`` [2] on, without the moves that lead out of them."""
+    local = jax.lax.dynamic_slice(moves, (0, corner[0], corner[1]), (len(MOVES), *size))
+    end = jnp.stack(jnp.meshgrid(*(jnp.arange(n) for n in size), indexing="ij"), axis=-1) + MOVES[:, None, None]
+    return jnp.where(jnp.all((end >= 0) & (end < jnp.array(size)), axis=-1), local, jnp.inf)

@@ -95,17 +95,18 @@ def _fly(task: AirWaypoints, site: Site, position: jax.Array, home: jax.Array) -
 
 
 def _drive(task: GroundWaypoints, site: Site, position: jax.Array, limits: RoverLimits) -> Path:
-    grid = route_grid(site, limits, task.block, position[:2])
+    grid = route_grid(site, limits, task.block)
     steps = 2 * sum(grid.cost.shape)
+    start, enters = grid.entry(position[:2])
 
     def leg(here: jax.Array, corner: jax.Array) -> tuple[jax.Array, jax.Array]:
-        goal = grid.cell_of(corner)
-        field = cost_to_go(grid.cost, goal, grid.cell_m)
-        cells = descend(field, grid.cost, here, grid.cell_m, steps)
+        goal, ends = grid.entry(corner)
+        field = cost_to_go(grid.moves, goal)
+        cells = descend(field, grid.moves, here, steps)
         reached = jnp.all(cells[-1] == goal)
         xy = grid.place(cells)
-        return cells[-1], xy.at[-1].set(jnp.where(reached, corner, xy[-1]))
+        return cells[-1], xy.at[-1].set(jnp.where(reached & ends, corner, xy[-1]))
 
-    _, legs = jax.lax.scan(leg, grid.cell_of(position[:2]), task.corners_m)
-    xy = legs.reshape(-1, 2).at[0].set(position[:2])
-    return ground_path(site, xy, task.speed_m_s, limits.acceleration_m_s2, task.points)
+    _, legs = jax.lax.scan(leg, start, task.corners_m)
+    xy = jnp.concatenate([position[None, :2], jnp.where(enters, legs.reshape(-1, 2), position[:2])])
+    return ground_path(site, xy, task.speed_m_s, limits, task.points)

@@ -1,5 +1,6 @@
 """Elevation models (GeoTIFF) as bare ground in a local ENU frame."""
 
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,16 @@ from swarmsim.site.model import VisualMesh
 from swarmsim.site.raster import Floats, Grid
 from swarmsim.site.visual import GROUND_COLOUR, TRIANGLES_MAX, welded
 
+SENTINELS = (-9999.0, -99999.0, -32768.0, -32767.0, 32767.0, -3.4028234663852886e38, 3.4028234663852886e38, 1e20)
+"""Values that stand for "no data" where a file does not say so."""
+HEIGHT_MAX_M = 12_000.0  # larger values, up or down, are no heights on Earth
+GAP_M = 100.0  # a value this far from all others, and farther than they differ, that is there again and again: no data
+SCALE_TOLERANCE = 0.005  # true length of a projected metre: nearer to one it is left alone
+STRETCH_MAX = 0.02  # largest change of that length over a raster
+DEGREES_MAX = 0.01  # smaller cells without a projection are no metres
+REPROJECT = "reproject it to metres, e.g. gdalwarp -t_srs EPSG:32632 IN.tif OUT.tif"
+FEET_M = (0.3048, 1200.0 / 3937.0)  # international and US survey foot
+
 
 @dataclass(frozen=True)
 class Elevation:
@@ -25,12 +36,18 @@ class Elevation:
     height: Floats  # [ny, nx] m; NaN where the file has no data
     colours: NDArray[np.uint8] | None  # [ny, nx, 3] of the orthophoto
     reference: dict[str, Any]  # crs; easting_m, northing_m and elevation_m of the local origin
+    warnings: tuple[str, ...] = ()  # what was assumed
 
 
 def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
-    """Read a GeoTIFF with square cells in a metric, north-up projection; raises `InputError` for any other."""
+    """Read a GeoTIFF with square cells in a metric, north-up projection; raises `InputError` for any other.
+
+    Lengths are true: a projection that stretches the ground, such as Web Mercator, is scaled back at the raster's
+    centre. Heights are in ``spec.height_unit_m``, or what the file says, or the unit of its projection.
+    """
     import rasterio
 
+    told: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
         try:
@@ -38,13 +55,16 @@ def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
                 _check_raster(file, path)
                 # Rows of a north-up raster run north to south; ours run south to north.
                 band = file.read(1, masked=True).astype(np.float64).filled(np.nan)[::-1]
+                band = band * float(file.scales[0]) + float(file.offsets[0])
                 matrix, crs = file.transform, file.crs
+                unit = spec.unit_m or _unit(crs, path, told)
+                height_unit = spec.height_unit_m or spec.unit_m or _height_unit(file, unit, told)
+                true = 1.0 if spec.unit_m else _true_scale(file, path, unit, told)
         except rasterio.errors.RasterioError as error:
             reason = str(error).splitlines()[0]
             raise InputError.of(f"cannot be read as GeoTIFF ({reason})", file=path) from error
-    unit = spec.unit_m or (crs.linear_units_factor[1] if crs else 1.0)
-    cell = float(matrix.a) * unit
-    height = np.where(np.isfinite(band), band, np.nan) * (spec.unit_m or 1.0)
+    height = _with_data(np.where(np.isfinite(band), band, np.nan), height_unit, told) * height_unit
+    cell = float(matrix.a) * unit * true
     ny, nx = height.shape
     if not np.isfinite(height).any():
         raise InputError.of("holds no elevation: every cell is empty", file=path)
@@ -53,18 +73,128 @@ def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
     base = float(middle if np.isfinite(middle) else np.nanmean(height))
     reference = {
         "crs": crs.to_string() if crs else None,
-        "easting_m": float(matrix.c * unit + 0.5 * nx * cell),
-        "northing_m": float(matrix.f * unit - 0.5 * ny * cell),
+        "easting_m": float(matrix.c + 0.5 * nx * matrix.a) * unit,
+        "northing_m": float(matrix.f - 0.5 * ny * matrix.a) * unit,
         "elevation_m": base,
+        "metres_per_projected_metre": true,
     }
     photo = None if spec.orthophoto is None else _orthophoto(path.parent / spec.orthophoto, (ny, nx))
-    return Elevation(grid, height - base, photo, reference)
+    return Elevation(grid, height - base, photo, reference, tuple(told))
 
 
 def own_cell(path: Path) -> float:
-    """Edge length of a GeoTIFF's cells in its projection, m."""
+    """Edge length of a GeoTIFF's cells on the ground, m."""
     spec = SiteSpec(name="elevation", file=path.name, licence="-", cell_m=1.0, max_file_mb=1e6)
     return read_elevation(path, spec).grid.cell
+
+
+def _unit(crs: Any, path: Path, told: list[str]) -> float:
+    """Length in m of the unit of a projection."""
+    if not crs:
+        told.append("the file names no projection: its coordinates are taken as metres; set unit_m (--unit) if not")
+        return 1.0
+    try:
+        return float(crs.linear_units_factor[1])
+    except Exception as error:  # rasterio raises its own errors for what GDAL does not know
+        raise InputError.of(
+            "has a projection without a unit of length", file=path, path="unit_m",
+            suggestion="set unit_m to the length of its unit in metres (--unit 1 for metres)",
+        ) from error  # fmt: skip
+
+
+def _height_unit(file: Any, unit: float, told: list[str]) -> float:
+    """Length in m of the unit of the heights: that of the band, or of the vertical reference, or of the projection."""
+    name = (file.units[0] or "").strip().casefold()
+    wkt = file.crs.to_wkt() if file.crs else ""
+    vertical = re.search(r"VERT_?C(?:S|RS)\[.*?(?:LENGTH)?UNIT\[\"[^\"]*\",\s*([0-9.eE+-]+)", wkt, re.DOTALL)
+    if name in ("m", "metre", "meter", "metres", "meters"):
+        return 1.0
+    if name in ("ft", "foot", "feet", "us-ft", "us survey foot", "ftus", "foot_us"):
+        return FEET_M[1] if "us" in name else FEET_M[0]
+    if vertical:
+        return float(vertical.group(1))
+    if abs(unit - 1.0) > 1e-9:
+        told.append(
+            f"the file does not say the unit of its heights: taken as that of its projection, {unit:.6g} m; "
+            "set height_unit_m (--height-unit 1) if they are metres"
+        )
+    return unit
+
+
+def _true_scale(file: Any, path: Path, unit: float, told: list[str]) -> float:
+    """Metres on the ground for a metre in the projection at the raster's centre, by the curvature of the ellipsoid.
+
+    Radii of curvature of WGS 84: Snyder, "Map Projections: A Working Manual", USGS 1395 (1987), eq. 4-18 to 4-20.
+    """
+    if not file.crs or not file.crs.is_projected:
+        return 1.0
+    from rasterio.warp import transform
+
+    matrix, rows, columns = file.transform, file.height, file.width
+    x = matrix.c + matrix.a * columns * np.array([0.5, 0.0, 1.0, 0.5, 0.5])
+    y = matrix.f + matrix.e * rows * np.array([0.5, 0.5, 0.5, 0.0, 1.0])
+    step = 10.0 / unit
+    try:
+        longitude, latitude = (
+            np.radians(np.array(values).reshape(3, 5))
+            for values in transform(
+                file.crs, "EPSG:4326", np.concatenate([x, x + step, x]), np.concatenate([y, y, y + step])
+            )
+        )
+    except Exception as error:
+        raise InputError.of(
+            f"has a projection that cannot be turned into latitudes ({str(error).splitlines()[0]})", file=path,
+            suggestion=f"{REPROJECT}, or set unit_m (--unit 1)",
+        ) from error  # fmt: skip
+    axis, square = 6_378_137.0, 0.00669437999014
+    bend = 1.0 - square * np.sin(latitude[0]) ** 2
+    along, across = axis * (1.0 - square) / bend**1.5, axis / np.sqrt(bend) * np.cos(latitude[0])
+    east, north = (
+        np.hypot(across * (longitude[k] - longitude[0]), along * (latitude[k] - latitude[0])) / 10.0 for k in (1, 2)
+    )
+    scale = np.sqrt(east * north)
+    if not np.isfinite(scale).all() or np.ptp(scale) > STRETCH_MAX * scale[0]:
+        raise InputError.of(
+            "its projection does not keep lengths over the raster", file=path,
+            suggestion=f"cut out a smaller piece, or {REPROJECT}",
+        )  # fmt: skip
+    if abs(scale[0] - 1.0) <= SCALE_TOLERANCE:
+        return 1.0
+    told.append(
+        f"a metre in its projection ({file.crs.to_string()}) is {scale[0]:.4f} m on the ground here: lengths are those "
+        "on the ground"
+    )
+    return float(scale[0])
+
+
+def _with_data(height: Floats, unit: float, told: list[str]) -> Floats:
+    """``height`` [ny, nx] with NaN in place of values that stand for "no data" although the file does not say so."""
+    found = np.isin(height, np.array(SENTINELS)) | np.isin(height.astype(np.float32), np.array(SENTINELS, np.float32))
+    found |= np.abs(height) * unit > HEIGHT_MAX_M
+    for _ in range(2):  # the lowest value and the highest one
+        rest = np.unique(height[np.isfinite(height) & ~found])
+        for value, following, span in ((rest[:1], rest[1:2], rest[1:]), (rest[-1:], rest[-2:-1], rest[:-1])):
+            if len(span) and abs(following[0] - value[0]) * unit > max(GAP_M, np.ptp(span) * unit):
+                again = height == value[0]
+                if again.sum() > 1:
+                    found |= again
+    if not found.any():
+        return height
+    values = np.unique(height[found])
+    shown = ", ".join(f"{value:g}" for value in values[:4]) + (" …" if len(values) > 4 else "")
+    told.append(
+        f"{int(found.sum())} cells hold {shown}, taken as no data, which the file does not declare "
+        f"(gdal_edit.py -a_nodata {values[0]:g} declares it)"
+    )
+    height = np.where(found, np.nan, height)
+    # Resampling mixes such a value into the cells beside it.
+    rest = height[np.isfinite(height)]
+    if rest.size:
+        low, high = np.percentile(rest, [2.0, 98.0])
+        reach = 3.0 * (high - low) + GAP_M / unit
+        beside = ndimage.binary_dilation(found, iterations=2)
+        height = np.where(beside & ((height < low - reach) | (height > high + reach)), np.nan, height)
+    return height
 
 
 def _check_raster(file: Any, path: Path) -> None:
@@ -78,8 +208,13 @@ def _check_raster(file: Any, path: Path) -> None:
         raise InputError.of(
             "is in degrees",
             file=path,
-            suggestion="reproject it to metres, e.g. gdalwarp -t_srs EPSG:32632 IN.tif OUT.tif",
+            suggestion=REPROJECT,
         )
+    if not file.crs and matrix.a < DEGREES_MAX:
+        raise InputError.of(
+            f"has cells of {matrix.a:g} and names no projection: they are probably degrees", file=path,
+            suggestion="say so and reproject it, e.g. gdalwarp -s_srs EPSG:4326 -t_srs EPSG:32632 IN.tif OUT.tif",
+        )  # fmt: skip
     if matrix.b or matrix.d or matrix.e >= 0 or abs(matrix.a + matrix.e) > 1e-3 * matrix.a:
         raise InputError.of(
             "must be north-up with square cells", file=path, given=f"transform {tuple(matrix)[:6]}",

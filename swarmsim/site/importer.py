@@ -1,7 +1,6 @@
 """Import of a source file and its specification as arrays: terrain, surface, obstacles, clearance, cost."""
 
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -9,17 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from swarmsim.config.errors import InputError, Problem, raise_if_any
-from swarmsim.config.names import did_you_mean, one_of
-from swarmsim.config.site import ObstacleMaterial, SiteSpec
+from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.site import Plane, SiteSpec
 from swarmsim.site import traversability
 from swarmsim.site.elevation import elevation_ground, elevation_mesh, read_elevation
 from swarmsim.site.ground import THICKNESS, Ground, complete_ground, found_ground, named_ground
-from swarmsim.site.meshes import Part, read_mesh
+from swarmsim.site.mesh_parts import NO_COLOUR, Part
+from swarmsim.site.meshes import read_mesh
 from swarmsim.site.model import VisualMesh
-from swarmsim.site.obstacles import Box, boxes_of, components
+from swarmsim.site.obstacles import Box
+from swarmsim.site.part_rules import BOXES_MAX, check_patterns, described, find_obstacles, matches, unnamed_told
 from swarmsim.site.raster import Floats, Grid, faces_on, top_of_cells
 from swarmsim.site.source_files import TIFF_SUFFIXES, check_file
+from swarmsim.site.start_places import start_places
 from swarmsim.site.step_edges import StepRasters, find_steps
 from swarmsim.site.survey import survey_area
 from swarmsim.site.visual import visual_mesh
@@ -27,8 +28,10 @@ from swarmsim.site.visual import visual_mesh
 Mask = NDArray[np.bool_]
 
 CELLS_MAX = 4_000_000
-AIR = "air"  # material of parts painted on others, such as windows, which get no box
-BOXES_MAX = 1024  # the largest are kept: every ray is intersected with every box
+FLUSH_M = 0.02  # what rises no further above the ground does not stand on it
+COARSE_M = 0.3  # cells of the raster of clearances that a user is told of
+BARE_SHARE = 0.05  # of a site that is traversable: below it there is hardly any ground
+PLANE = "level ground"  # name of the part that `SiteSpec.plane` adds
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class RawSite:
     grid: Grid
     terrain: Floats  # [ny, nx] m
     surface: Floats  # [ny, nx] m
-    clearance: Floats  # [ny, nx] m
+    clearance: Floats  # [f ny, f nx] m
     cost: Floats  # [ny, nx]
     steps: StepRasters | None
     boxes: list[Box]
@@ -54,31 +57,54 @@ def build(path: Path, spec: SiteSpec) -> RawSite:
     return _from_elevation(path, spec) if path.suffix.lower() in TIFF_SUFFIXES else _from_mesh(path, spec)
 
 
+@dataclass(frozen=True)
+class _Separated:
+    """A mesh split into ground and what stands on it."""
+
+    bare: Mask  # [t] triangles that are ground, or lie below it
+    ground: Ground
+    surface: Floats  # [ny, nx] m
+    warnings: list[str]
+
+
 def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
-    parts = read_mesh(path, spec)
-    _check_patterns(parts, spec, path)
+    mesh = read_mesh(path, spec)
+    parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh.parts, spec.plane)]
+    check_patterns(parts, spec, path)
     corners = np.concatenate([part.corners for part in parts])
     grid = _grid_of(corners, spec, path)
-    is_ground, ground, surface = _separate(parts, corners, grid, spec, path)
-    boxes, names, solid, passable = _obstacles(parts, is_ground, spec)
-    stopping = [box for box, free in zip(boxes, passable, strict=True) if not free]
+    found = _separate(parts, corners, grid, spec, path)
+    ground = found.ground
+    things = find_obstacles(parts, found.bare, spec)
+    stopping = [box for box, free in zip(things.boxes, things.passable, strict=True) if not free]
     clear = traversability.clearance(
-        grid, ground.height, ground.outside, corners[solid], stopping, spec.zones, spec.traversability
+        grid, ground.height, ground.outside, corners[things.stops], stopping, spec.zones, spec.traversability
     )
-    carries = is_ground | solid
-    steps = find_steps(grid, ground.height, clear, corners[carries], spec.traversability.step_max_m)
+    carries = found.bare | things.stops
+    coarse = traversability.at_centres(clear, grid)
+    steps = find_steps(grid, ground.height, coarse, corners[carries], spec.traversability.step_max_m)
+    boxes = things.boxes
     kept = sorted(np.argsort([-box.volume for box in boxes], kind="stable")[:BOXES_MAX])
+    told = described(parts, found.bare, spec)
     report = {
-        "parts": [
-            {"names": list(part.names), "triangles": len(part.triangles), "is": _is(part, share, spec)}
-            for part, share in zip(parts, _shares(parts, is_ground), strict=True)
-        ],
+        "parts": told,
         "boxes_left_out": len(boxes) - len(kept),
+        "shift_m": list(mesh.shift_m),
+        "warnings": [*mesh.warnings, *found.warnings, *unnamed_told(told, spec)],
     }
     return _finish(
-        grid, ground, surface, clear, steps, [boxes[i] for i in kept], [names[i] for i in kept],
-        visual_mesh(parts, is_ground, spec), spec, report,
+        grid, ground, found.surface, clear, steps, [boxes[i] for i in kept], [things.materials[i] for i in kept],
+        visual_mesh(parts, found.bare, spec), spec, report,
     )  # fmt: skip
+
+
+def _plane(parts: list[Part], plane: Plane) -> Part:
+    """Level ground under the parts and around them."""
+    points = np.concatenate([part.vertices[np.unique(part.triangles), :2] for part in parts])
+    (west, south), (east, north) = points.min(axis=0) - plane.margin_m, points.max(axis=0) + plane.margin_m
+    vertices = np.array([[x, y, plane.height_m] for y in (south, north) for x in (west, east)])
+    colours = np.tile(np.array(NO_COLOUR, np.uint8), (2, 1))
+    return Part((PLANE,), vertices, np.array([[0, 1, 3], [0, 3, 2]]), colours)
 
 
 def _from_elevation(path: Path, spec: SiteSpec) -> RawSite:
@@ -92,7 +118,7 @@ def _from_elevation(path: Path, spec: SiteSpec) -> RawSite:
     ground = elevation_ground(model, grid, spec)
     nothing = np.empty((0, 3, 3))
     clear = traversability.clearance(grid, ground.height, ground.outside, nothing, [], spec.zones, spec.traversability)
-    report = {"parts": [], "boxes_left_out": 0, "georeference": model.reference}
+    report = {"parts": [], "boxes_left_out": 0, "georeference": model.reference, "warnings": list(model.warnings)}
     return _finish(grid, ground, ground.height, clear, None, [], [], elevation_mesh(model, grid, ground), spec, report)
 
 
@@ -102,11 +128,18 @@ def _finish(
     mesh: VisualMesh, spec: SiteSpec, report: dict[str, Any],
 ) -> RawSite:  # fmt: skip
     rise = None if steps is None else steps.edge[..., 3]
-    cost = traversability.cost(grid, ground.height, clear, spec.traversability, rise)
+    coarse = traversability.at_centres(clear, grid)
+    cost = traversability.cost(grid, ground.height, coarse, spec.traversability, rise)
     inside = ~ground.outside
     slope = np.degrees(np.arctan(np.hypot(*np.gradient(ground.height, grid.cell))))
+    area = survey_area(grid, inside, spec)
+    starts = start_places(grid, ground.height, surface, coarse, cost, area)
+    (west, south), (east, north) = grid.bounds
     report |= {
         "size_m": [grid.nx * grid.cell, grid.ny * grid.cell],
+        "bounds_m": [west, south, east, north],
+        "survey_area_m": np.round(area, 2).tolist(),
+        "start_places_m": starts,
         "area_m2": float(inside.sum() * grid.cell**2),
         "relief_m": float(np.ptp(ground.height[inside])),
         "height_m": [float(ground.height[inside].min()), float(surface[inside].max())],
@@ -116,42 +149,38 @@ def _finish(
         "filled_cells": int(ground.filled.sum()),
         "outside_cells": int(ground.outside.sum()),
         "traversable_share": float(np.isfinite(cost)[inside].mean()),
-        "warnings": [],
+        "clearance_cell_m": grid.cell * grid.ny / len(clear),
     }
-    if ground.filled.any():
-        report["warnings"].append(f"{ground.filled.sum()} cells are holes in the source, filled by interpolation")
-    if report["boxes_left_out"]:
-        report["warnings"].append(f"the {report['boxes_left_out']} smallest obstacles do not attenuate radiation")
-    if not np.isfinite(cost).any():
-        report["warnings"].append("no cell is traversable: a rover cannot drive here")
-    area = survey_area(grid, inside, spec)
+    report["warnings"] += _warnings(report, ground, inside)
     return RawSite(grid, ground.height, surface, clear, cost, steps, boxes, names, area, mesh, report)
 
 
-def _matches(part: Part, pattern: str) -> bool:
-    return any(fnmatchcase(name.casefold(), pattern.casefold()) for name in part.names)
-
-
-def _rule(part: Part, spec: SiteSpec) -> ObstacleMaterial:
-    """The first rule of the specification that matches a part."""
-    default = ObstacleMaterial(match="*", material=spec.default_material)
-    return next((rule for rule in spec.obstacles if _matches(part, rule.match)), default)
-
-
-def _check_patterns(parts: list[Part], spec: SiteSpec, path: Path) -> None:
-    names = sorted({name for part in parts for name in part.names})
-    shown = one_of(names[:40]) + (f" … ({len(names)} names)" if len(names) > 40 else "")
-    given = [("ground", pattern) for pattern in spec.ground] + [("obstacles", rule.match) for rule in spec.obstacles]
-    raise_if_any(
-        [
-            Problem(
-                f"no mesh material or geometry matches '{pattern}' of '{key}'", file=str(path), path=key,
-                given=pattern, allowed=shown, suggestion=did_you_mean(pattern, names),
-            )
-            for key, pattern in given
-            if not any(_matches(part, pattern) for part in parts)
-        ]
-    )  # fmt: skip
+def _warnings(report: dict[str, Any], ground: Ground, inside: Mask) -> list[str]:
+    """What a user should know of a site."""
+    found = []
+    if ground.filled.any():
+        share = 100.0 * ground.filled.sum() / inside.sum()
+        found.append(
+            f"{ground.filled.sum()} cells ({share:.1f} % of the ground) are holes in the source, "
+            "filled by interpolation"
+        )
+    if report["boxes_left_out"]:
+        found.append(f"the {report['boxes_left_out']} smallest obstacles do not attenuate radiation")
+    if report["boxes"] and report["clearance_cell_m"] > COARSE_M:
+        found.append(
+            f"the site is large: obstacles are known to {report['clearance_cell_m']:.2g} m only, which closes narrow "
+            "gaps to rovers"
+        )
+    if report["traversable_share"] == 0.0:
+        found.append("no cell is traversable: a rover cannot drive here")
+    elif not report["start_places_m"]:
+        found.append("there is no free place to start: everywhere something stands near, or the ground is steep")
+    if report["traversable_share"] < BARE_SHARE and report["parts"]:
+        found.append(
+            "hardly any of it is open ground: if the model is a building without its surroundings, plane (--plane 20) "
+            "lays level ground 20 m around it"
+        )
+    return found
 
 
 def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
@@ -161,7 +190,8 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
     if up > 2.0 * min(east, north):
         raise InputError.of(
             f"the site stands on its edge: {shape}", file=path, path="up_axis",
-            suggestion="set up_axis to the axis that points up in the file (X, Y or Z)",
+            suggestion="set up_axis (--up) to the axis that points up in the file, X, Y or Z; or, if it is a tower "
+            "without its surroundings, lay level ground around it with plane (--plane 20)",
         )  # fmt: skip
     if not spec.extent_m[0] <= max(east, north) <= spec.extent_m[1]:
         small = max(east, north) < spec.extent_m[0]
@@ -171,8 +201,9 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
         raise InputError.of(
             f"the site would be {'tiny' if small else 'huge'}: {shape}; the unit is probably wrong", file=path,
             path="unit_m", allowed=f"a longer side of {spec.extent_m[0]:g} to {spec.extent_m[1]:g} m (extent_m)",
-            suggestion=f"set unit_m to the length of the file's unit in metres, e.g. {units}; "
-            "or widen extent_m if the site really is that large",
+            suggestion=f"set unit_m (--unit) to the length of the file's unit in metres, e.g. {units}; or, if the site "
+            f"really is that {'small' if small else 'large'}, widen extent_m (--set 'extent_m=[1, 5000]')"
+            + ("; plane (--plane 20) lays level ground around a single building" if small else ""),
         )  # fmt: skip
     nx, ny = (int(np.floor(side / spec.cell_m + 0.5 + 1e-6)) for side in (east, north))
     check_cells(nx, ny, spec, path)
@@ -186,29 +217,47 @@ def check_cells(nx: int, ny: int, spec: SiteSpec, path: Path) -> None:
         raise InputError.of(
             f"cells of {spec.cell_m:g} m give a grid of {nx} x {ny}", file=path, path="cell_m",
             allowed=f"at least 3 x 3 and at most {CELLS_MAX:,} cells",
-            suggestion="choose smaller cells" if min(nx, ny) < 3 else "choose larger cells",
+            suggestion=f"choose {'smaller' if min(nx, ny) < 3 else 'larger'} cells: cell_m (--cell)",
         )  # fmt: skip
 
 
-def _separate(
-    parts: list[Part], corners: Floats, grid: Grid, spec: SiteSpec, path: Path
-) -> tuple[Mask, Ground, Floats]:
-    """Which triangles [t] are ground, the ground, and the surface [ny, nx]."""
-    if spec.ground:
-        named = [any(_matches(part, pattern) for pattern in spec.ground) for part in parts]
+def _separate(parts: list[Part], corners: Floats, grid: Grid, spec: SiteSpec, path: Path) -> _Separated:
+    """Ground and surface of a mesh with triangles ``corners`` [t, 3, 3]."""
+    told: list[str] = []
+    if spec.ground or spec.plane is not None:
+        patterns = [*spec.ground, *([] if spec.plane is None else [PLANE])]
+        named = [any(matches(part, pattern) for pattern in patterns) for part in parts]
         is_ground = np.repeat(named, [len(part.triangles) for part in parts])
         seen = named_ground(grid, corners[is_ground])
+        bare = is_ground | (_near_ground(grid, seen, corners) if spec.plane is not None else False)
     else:
-        seen = found_ground(grid, corners)
-        is_ground = _near_ground(grid, seen, corners)
-    top = top_of_cells(grid, corners[~is_ground]) if not is_ground.all() else np.full(seen.shape, np.nan)
+        seen, underlaid = found_ground(grid, corners)
+        if underlaid:
+            told.append(
+                f"below {100 * underlaid:.0f} % of the ground lies another surface, taken as a slab under the scene "
+                "and left out; if it is the ground, name its material or geometry: ground (--ground NAME)"
+            )
+        bare = _near_ground(grid, seen, corners)
+    top = top_of_cells(grid, corners[~bare]) if not bare.all() else np.full(seen.shape, np.nan)
     try:
         ground = complete_ground(seen, np.isfinite(top), spec.holes_max)
     except InputError as error:
         raise InputError([Problem(**{**vars(problem), "file": str(path)}) for problem in error.problems]) from error
+    bare |= _buried(grid, ground.height, corners)
     # Dilated by one cell, so that the bilinear surface is nowhere below the true one.
     grown = ndimage.maximum_filter(np.where(np.isfinite(top), top, -np.inf), 3, mode="nearest")
-    return is_ground, ground, np.maximum(ground.height, grown)
+    return _Separated(bare, ground, np.maximum(ground.height, grown), told)
+
+
+def _buried(grid: Grid, ground: Floats, corners: Floats) -> Mask:
+    """Triangles [t] that lie wholly below the ``ground`` [ny, nx] or flush with it, such as slabs and foundations."""
+    lowest_near = ndimage.minimum_filter(ground, 3, mode="nearest").ravel()
+    below = (corners[..., 2] < lowest_near[grid.cell_of(corners[..., :2])] + FLUSH_M).all(axis=1)
+    hits = faces_on(grid, corners[below])
+    above = hits.height > ground.ravel()[hits.cell] + FLUSH_M
+    index = np.flatnonzero(below)
+    below[index[np.unique(hits.triangle[above])]] = False
+    return below
 
 
 def _near_ground(grid: Grid, seen: Floats, corners: Floats) -> Mask:
@@ -226,33 +275,3 @@ def _near_ground(grid: Grid, seen: Floats, corners: Floats) -> Mask:
     cell = grid.cell_of(corners[..., :2])
     near = np.abs(corners[..., 2] - flat[cell]) <= allowance[cell]
     return np.where(touched > 0, away <= 0.5 * touched, near.all(axis=1))
-
-
-def _obstacles(parts: list[Part], is_ground: Mask, spec: SiteSpec) -> tuple[list[Box], list[str], Mask, list[bool]]:
-    """Boxes, their materials, triangles [t] that stop a rover, and whether a rover can pass each box."""
-    boxes: list[Box] = []
-    names: list[str] = []
-    passable: list[bool] = []
-    stops = ~is_ground
-    start = 0
-    for part in parts:
-        span = slice(start, start + len(part.triangles))
-        start = span.stop
-        rule = _rule(part, spec)
-        stops[span] &= not rule.traversable
-        own = part.triangles[~is_ground[span]] if rule.material != AIR else part.triangles[:0]
-        for piece in components(part.vertices, own) if len(own) else ():
-            found = boxes_of(part.vertices[own[piece]], rule.wall_m)
-            boxes += found
-            names += [rule.material] * len(found)
-            passable += [rule.traversable] * len(found)
-    return boxes, names, stops, passable
-
-
-def _shares(parts: list[Part], is_ground: Mask) -> list[float]:
-    edges = np.cumsum([len(part.triangles) for part in parts])[:-1]
-    return [float(piece.mean()) for piece in np.split(is_ground, edges)]
-
-
-def _is(part: Part, ground_share: float, spec: SiteSpec) -> str:
-    return "ground" if ground_share > 0.5 else _rule(part, spec).material

@@ -45,7 +45,8 @@ class Site:
     cell_m: jax.Array  # [] edge length of a cell
     terrain_m: jax.Array  # [ny, nx] height of the bare ground
     surface_m: jax.Array  # [ny, nx] highest surface in the cell: ground, roofs, trees
-    clearance_m: jax.Array  # [ny, nx] signed distance to the nearest obstacle, zone or border; < 0 inside
+    clearance_m: jax.Array  # [f ny, f nx] signed distance to the nearest obstacle, zone or border for a rover; < 0
+    # inside. Each cell of the other rasters holds f x f of its cells, so that it knows thin walls.
     cost: jax.Array  # [ny, nx] cost of driving one metre, >= 1; inf where a rover cannot drive
     obstacles: Obstacles
     survey_area_m: jax.Array  # [V, 2] ENU convex polygon, counter-clockwise
@@ -75,11 +76,21 @@ class SiteModel:
     report: dict[str, Any]  # area_m2, relief_m, obstacles, filled_cells, warnings … (plain JSON values)
 
 
+def _cells_of(site: Site, raster: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Centre [2] of the south-west cell of a raster and its cell's edge length [] (m): the site's, or finer cells."""
+    factor = max(1, raster.shape[0] // site.terrain_m.shape[0])
+    if factor == 1:
+        return site.origin_m, site.cell_m
+    cell = site.cell_m / factor
+    return site.origin_m - 0.5 * (site.cell_m - cell), cell
+
+
 def _cell(site: Site, raster: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Values at the corners [..., 4] (SW, SE, NW, NE), place in the cell [..., 2], and whether inside [..., 2]."""
     ny, nx = raster.shape
     last = jnp.array([nx - 1, ny - 1], jnp.float32)
-    place = (xy - site.origin_m) / site.cell_m
+    origin, size = _cells_of(site, raster)
+    place = (xy - origin) / size
     clamped = jnp.clip(place, 0.0, last)
     # Clip the integer as well: the conversion of a NaN is undefined.
     index = jnp.clip(clamped.astype(jnp.int32), 0, jnp.array([nx - 2, ny - 2]))
@@ -91,7 +102,7 @@ def _cell(site: Site, raster: jax.Array, xy: jax.Array) -> tuple[jax.Array, jax.
 def sample(raster: jax.Array, site: Site, xy: jax.Array) -> jax.Array:
     """Bilinear value of a site's raster at ``xy`` [..., 2] (ENU, m), clamped at the border; [...].
 
-    ``raster`` [ny, nx] must be finite (not ``Site.cost``, whose inf would turn to NaN between cells).
+    ``raster`` [ny, nx] or [f ny, f nx] must be finite (not ``Site.cost``, whose inf would turn to NaN between cells).
     """
     corners, t, _ = _cell(site, raster, xy)
     x, y = t[..., 0], t[..., 1]
@@ -121,7 +132,7 @@ def sample_with_gradient(raster: jax.Array, site: Site, xy: jax.Array) -> tuple[
     south = corners[..., 0] + x * east_south
     north = corners[..., 2] + x * east_north
     slope = jnp.stack([east_south + y * (east_north - east_south), north - south], axis=-1)
-    return south + y * (north - south), jnp.where(inside, slope / site.cell_m, 0.0)
+    return south + y * (north - south), jnp.where(inside, slope / _cells_of(site, raster)[1], 0.0)
 
 
 def height_at(site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:

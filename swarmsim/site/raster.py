@@ -29,6 +29,12 @@ class Grid:
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     @property
+    def bounds(self) -> tuple[Floats, Floats]:
+        """South-west and north-east corner [2] of the grid, m."""
+        low = np.array(self.origin) - 0.5 * self.cell
+        return low, low + self.cell * np.array([self.nx, self.ny])
+
+    @property
     def corners(self) -> "Grid":
         """The grid whose points are the corners of these cells."""
         half = 0.5 * self.cell
@@ -115,6 +121,29 @@ def edge_points(corners: Floats, spacing: float) -> tuple[Floats, Integers]:
     edge = np.repeat(np.arange(len(start)), pieces + 1)
     within = np.arange(len(edge)) - np.repeat(np.cumsum(pieces + 1) - pieces - 1, pieces + 1)
     return start[edge] + (within / pieces[edge])[:, None] * step[edge], edge // 3
+
+
+def surface_points(corners: Floats, spacing: float) -> Iterator[Floats]:
+    """Points [p, 3] of triangles [t, 3, 3], edges included, at most ``spacing`` apart along each surface; in chunks."""
+    if len(corners) == 0:
+        return
+    # The longest edge is opposite the first corner: the two others span the triangle with the fewest points.
+    opposite = np.linalg.norm(np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1), axis=-1)
+    first = (np.argmax(opposite, axis=1)[:, None] + np.arange(3)) % 3
+    ordered = np.take_along_axis(corners, first[..., None], axis=1)
+    sides = ordered[:, 1:] - ordered[:, :1]
+    pieces = np.maximum(np.ceil(np.linalg.norm(sides, axis=-1) / spacing).astype(np.int64), 1)
+    count = (pieces + 1).prod(axis=1)
+    for part in _chunks(np.arange(len(corners)), count):
+        triangle = np.repeat(part, count[part])
+        within = np.arange(len(triangle)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
+        across = pieces[triangle, 0] + 1
+        u, v = (within % across) / pieces[triangle, 0], (within // across) / pieces[triangle, 1]
+        kept = u + v <= 1.0 + 1e-9
+        triangle, u, v = triangle[kept], u[kept], v[kept]
+        yield ordered[triangle, 0] + u[:, None] * sides[triangle, 0] + v[:, None] * sides[triangle, 1]
+    for start in range(0, len(corners), 20_000):
+        yield edge_points(corners[start : start + 20_000], spacing)[0]
 
 
 def highest(grid: Grid, hits: Hits, empty: float = np.nan) -> Floats:

@@ -1,6 +1,7 @@
 """Source files of sites: the formats that can be read, and the checks before a file is opened."""
 
-from pathlib import Path
+import re
+from pathlib import Path, PurePath
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.names import did_you_mean, one_of
@@ -28,5 +29,15 @@ def check_file(path: Path, max_file_mb: float) -> None:
     if size > max_file_mb * 1e6:
         raise InputError.of(
             f"the file has {size / 1e6:.0f} MB", file=path, allowed=f"at most {max_file_mb:g} MB (max_file_mb)",
-            suggestion="decimate the mesh (100,000 triangles are plenty for a site), or raise max_file_mb",
+            suggestion="decimate the mesh (100,000 triangles are plenty for a site), or raise max_file_mb "
+            f"(--set max_file_mb={size / 1e6 + 1:.0f})",
         )  # fmt: skip
+
+
+def material_files(source: Path) -> list[Path]:
+    """The files beside an OBJ file that describe its materials and exist."""
+    if source.suffix.lower() != ".obj":
+        return []
+    text = source.read_text(encoding="utf-8", errors="replace")
+    named = [PurePath(name.strip().replace("\\", "/")).name for name in re.findall(r"^mtllib[ \t]+(.+)$", text, re.M)]
+    return [source.parent / name for name in dict.fromkeys(named) if (source.parent / name).is_file()]

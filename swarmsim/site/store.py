@@ -20,15 +20,19 @@ from swarmsim.atomic_folder import atomic_folder
 from swarmsim.config.documents import dump_yaml
 from swarmsim.config.errors import InputError, Problem, file_errors_told
 from swarmsim.config.files import available, find
-from swarmsim.config.load import load_model, load_named
+from swarmsim.config.load import load_all, load_model, load_named
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import SiteSpec
 from swarmsim.pytree import on_device
+from swarmsim.site.material_guesses import Guess, guesses
 from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh
-from swarmsim.site.source_files import MAX_FILE_MB, check_file
+from swarmsim.site.source_files import MAX_FILE_MB, MESH_SUFFIXES, check_file, material_files
 from swarmsim.site.terrain_crossing import ceilings
 
 Arrays = dict[str, np.ndarray]
+
+UNKNOWN_WALL_M = 0.2
+"""Thickness of the shells of obstacles of which nothing is known, in the specification of an imported mesh."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,7 @@ class ImportOptions:
     fields: dict[str, Any] | None = None  # further fields of SiteSpec, e.g. {"unit_m": 0.01, "ground": ["Ground*"]}
     overwrite: bool = False
     preview: bool = True  # write preview.png
+    guess: bool = True  # write rules for what the names of the mesh say of its materials
 
 
 def load_site(name_or_path: str | Path, material_names: Sequence[str]) -> SiteModel:
@@ -100,9 +105,9 @@ def _arrays(spec: SiteSpec, site_file: Path) -> Arrays:
 
 
 def _key(spec: SiteSpec, source: Path) -> str:
-    """Hash of everything that the import depends on: file, orthophoto, specification and the importer's code."""
+    """Hash of all that the import depends on: file and those beside it, specification and the importer's code."""
     digest = hashlib.sha256(spec.model_dump_json().encode())
-    files = [source] + ([source.parent / spec.orthophoto] if spec.orthophoto else [])
+    files = [source, *material_files(source)] + ([source.parent / spec.orthophoto] if spec.orthophoto else [])
     for file in [*files, *sorted(Path(__file__).parent.glob("*.py"))]:
         digest.update(hashlib.sha256(file.read_bytes() if file.is_file() else b"").digest())
     return digest.hexdigest()[:24]
@@ -136,8 +141,9 @@ def _pack_steps(steps: Any) -> Arrays:
 
 def _checked(arrays: Arrays) -> Arrays:
     """The arrays of a cache entry; raises `KeyError` or `ValueError` when they are not those of a site."""
-    shapes = {arrays[key].shape for key in ("terrain", "surface", "clearance", "cost")}
-    complete = {"grid", "boxes", "box_materials", "survey_area", "vertices", "triangles", "colours", "report"}
+    shapes = {arrays[key].shape for key in ("terrain", "surface", "cost")}
+    more = {"grid", "clearance", "boxes", "box_materials", "survey_area"}
+    complete = more | {"vertices", "triangles", "colours", "report"}
     if len(shapes) != 1 or not complete <= arrays.keys() or not np.isfinite(arrays["terrain"]).all():
         raise ValueError("damaged cache entry")
     return arrays
@@ -201,13 +207,14 @@ def import_site(
     told = file_errors_told("the site cannot be written there", file=out)
     with told, atomic_folder(out, partial(_check_out, overwrite=options.overwrite)) as folder:
         try:
-            model = _make(folder, source, data, material_names)
+            model, found = _make(folder, source, data, material_names, options.guess)
         except InputError as error:
             raise InputError([_with_user_file(p, folder, out, source) for p in error.problems]) from error
         if options.preview:
             from swarmsim.site.preview import write_preview
 
             write_preview(model, folder / "preview.png")
+    model.report["guesses"] = [str(each) for each in found]
     return model
 
 
@@ -220,15 +227,35 @@ def _check_out(out: Path, overwrite: bool) -> None:
         )
 
 
-def _make(folder: Path, source: Path, data: dict[str, Any], material_names: Sequence[str]) -> SiteModel:
-    """Write a site's specification and files into the empty ``folder``, and load it."""
+def _make(
+    folder: Path, source: Path, data: dict[str, Any], material_names: Sequence[str], guess: bool
+) -> tuple[SiteModel, list[Guess]]:
+    """Write a site's specification and files into the empty ``folder``, and load it; with the guesses written."""
+    spec = _written(folder, data, material_names)
+    shutil.copyfile(source, folder / spec.file)
+    for beside in material_files(source):
+        shutil.copyfile(beside, folder / beside.name)
+    if spec.orthophoto is not None:
+        shutil.copyfile(source.parent / spec.orthophoto, folder / spec.orthophoto)
+    found: list[Guess] = []
+    if guess and source.suffix.lower() in MESH_SUFFIXES:
+        from swarmsim.site.importer import build
+
+        known = {name: content for name, content in load_all("materials").items() if name in material_names}
+        found = guesses(build(folder / spec.file, spec).report["parts"], known)
+        rules = [*data.get("obstacles", ()), *(each.rule() for each in found)]
+        # What nothing is known of is more often a building or a thing of sheets than a solid block.
+        shell = {} if "default_wall_m" in data else {"default_wall_m": UNKNOWN_WALL_M}
+        spec = _written(folder, data | shell | {"obstacles": rules}, material_names)
+    return _model(spec, _arrays(spec, folder / "site.yaml"), material_names), found
+
+
+def _written(folder: Path, data: dict[str, Any], material_names: Sequence[str]) -> SiteSpec:
+    """The specification ``data``, written to ``folder`` and checked."""
     (folder / "site.yaml").write_text(dump_yaml(data), encoding="utf-8")
     spec: SiteSpec = load_model(folder / "site.yaml", SiteSpec)
     _check_materials(spec, material_names, folder / "site.yaml")
-    shutil.copyfile(source, folder / spec.file)
-    if spec.orthophoto is not None:
-        shutil.copyfile(source.parent / spec.orthophoto, folder / spec.orthophoto)
-    return _model(spec, _arrays(spec, folder / "site.yaml"), material_names)
+    return spec
 
 
 def _with_user_file(problem: Problem, folder: Path, out: Path, source: Path) -> Problem:

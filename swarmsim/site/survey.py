@@ -53,8 +53,7 @@ def _hull(points: Floats) -> Floats:
 
 def _inside_site(grid: Grid, polygon: Floats) -> Floats:
     """``polygon`` [v, 2], or `InputError` when a corner lies outside the grid."""
-    low = np.array(grid.origin) - 0.5 * grid.cell
-    high = low + grid.cell * np.array([grid.nx, grid.ny])
+    low, high = grid.bounds
     if ((polygon < low - 1e-6) | (polygon > high + 1e-6)).any():
         raise InputError.of(
             "the survey area reaches beyond the site", path="survey_area_m", given=str(polygon.tolist()),

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmsim.config.site import SiteSpec
-from swarmsim.site.meshes import NO_COLOUR, Part
+from swarmsim.site.mesh_parts import NO_COLOUR, Part
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.raster import Floats, Integers
 

@@ -136,21 +136,34 @@ def test_import_site(project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
         given.append((file, out, options))
         out.mkdir(parents=True)
         parts = [
-            {"names": [name], "is": what} for name, what in (("lawn", "ground"), ("shed", "wood"), ("hut", "wood"))
+            {"names": [name], "is": what}
+            for name, what in (("lawn [0]", "ground"), ("[red]shed", "wood"), ("hut", "wood"))
         ]
         return types.SimpleNamespace(
-            name=options.name or out.name, report={"area_m2": 123.0, "warnings": [], "parts": parts}
+            name=options.name or out.name,
+            report={"area_m2": 123.0, "warnings": ["[bold]loud[/bold]"], "parts": parts, "guesses": ["[blue]: wood"]},
         )
 
     monkeypatch.setattr("swarmsim.site.import_site", imported)
     command = ["import-site", "yard.obj", "--out", "configs/sites/yard", "--unit", "0.01", "--up", "Y", "--cell", "1"]
-    assert cli.main([*command, "--ground", "soil*", "--ground", "grass*", "--licence", "CC0-1.0"]) == 0
+    assert (
+        cli.main(
+            [*command, "--ground", "soil*", "--ground", "grass*", "--licence", "CC0-1.0", "--set", "holes_max=0.3"]
+        )
+        == 0
+    )
     file, out, options = given[0]
     assert (file, out, options.cell_m, options.overwrite) == (Path("yard.obj"), Path("configs/sites/yard"), 1.0, False)
     assert options.licence == "CC0-1.0"
-    assert options.fields == {"unit_m": 0.01, "up_axis": "Y", "ground": ["soil*", "grass*"]}
+    assert options.fields == {"unit_m": 0.01, "up_axis": "Y", "ground": ["soil*", "grass*"], "holes_max": 0.3}
     printed = capsys.readouterr().out
-    for fragment in ("area_m2", "ground: lawn", "wood: shed, hut", "none"):
+    for fragment in (
+        "area_m2",
+        "ground: lawn [0]",
+        "wood: [red]shed, hut",
+        "warning: [bold]loud[/bold]",
+        "[blue]: wood",
+    ):
         assert fragment in printed
     assert cli.main(command) == 2
     assert "--force" in capsys.readouterr().err

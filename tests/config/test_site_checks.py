@@ -67,6 +67,7 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
         ("vehicles.uav1.position_m=[-85, 0]", "vehicles.0.position_m", ["'uav1' starts outside the site", "x from"]),
         ("vehicles.uav1.position_m=[0, 8]", "vehicles.0.position_m", ["'uav1' starts inside an obstacle of brick"]),
         ("vehicles.uav1.position_m=[5.2, 0]", "vehicles.0.position_m", ["or touches it", "from every obstacle"]),
+        ("vehicles.orpheus.position_m=[-69.9, 0]", "vehicles.3.position_m", ["'orpheus' starts where a rover cannot"]),
         ("vehicles.orpheus.position_m=[-75, 0]", "vehicles.3.position_m", ["'orpheus' starts where a rover cannot"]),
         (f"{SURVEY}.area_m=[[0, 0], [200, 0], [0, 60]]", f"{FIRST}.area_m", ["reaches beyond the site", "[200, 0]"]),
         (f"{SURVEY}.area_m=[[0, 0], [5, 0], [5, 60], [0, 60]]", f"{FIRST}.area_m", ["no room for one", "10 m"]),

@@ -7,7 +7,7 @@ import pytest
 
 from swarmsim.policies.ground_path import RoverLimits
 from swarmsim.policies.ground_search import ApproachAndOrbit, SearchTask
-from swarmsim.policies.routes import coarsen, cost_to_go, descend, smooth
+from swarmsim.policies.routes import MOVES, coarsen, cost_to_go, descend, move_costs, smooth
 from swarmsim.site import Steps
 from tests.policies.assignments import assignment, situation
 from tests.policies.sites import block_site
@@ -44,9 +44,14 @@ def drive(start, target, site, **task):
     return jax.tree.map(lambda x: x[0], paths)
 
 
+def moves_over(cost, cell=1.0):
+    """Moves on the ``cost`` [ny, nx] where a vehicle fits everywhere."""
+    cost = jnp.asarray(cost, jnp.float32)
+    return move_costs(cost, jnp.ones((len(MOVES), *cost.shape), bool), jnp.float32(cell))
+
+
 def test_cost_to_go_on_open_ground_is_the_distance_within_the_grid_error():
-    cost = jnp.ones((41, 61))
-    field = np.asarray(cost_to_go(cost, jnp.array([20, 30]), jnp.float32(2.0)))
+    field = np.asarray(cost_to_go(moves_over(np.ones((41, 61)), 2.0), jnp.array([20, 30])))
     rows, columns = np.mgrid[:41, :61]
     distance = 2.0 * np.hypot(rows - 20, columns - 30)
     away = distance > 0
@@ -54,13 +59,15 @@ def test_cost_to_go_on_open_ground_is_the_distance_within_the_grid_error():
     assert (field[away] <= distance[away] * 1.0281).all()
 
 
-def test_detour_takes_the_cheaper_side_of_a_wall():
+@pytest.mark.parametrize("slanted", [False, True])
+def test_no_move_leads_across_a_wall_of_one_cell(slanted):
     cost = np.ones((40, 40), np.float32)
-    cost[5:40, 20] = np.inf  # the gap is in the south, at rows 0 to 4
-    cost[5:40, 21] = np.inf
-    field = cost_to_go(jnp.array(cost), jnp.array([30, 30]), jnp.float32(1.0))
-    route = np.asarray(descend(field, jnp.array(cost), jnp.array([30, 10]), jnp.float32(1.0), 120))
-    assert tuple(route[-1]) == (30, 30)
+    for row in range(5, 40):  # the gap is in the south, at rows 0 to 4
+        cost[row, row if slanted else 20] = np.inf
+    moves = moves_over(cost)
+    field = cost_to_go(moves, jnp.array([30, 36]))
+    route = np.asarray(descend(field, moves, jnp.array([36, 10]), 120))
+    assert tuple(route[-1]) == (30, 36)
     assert route[:, 0].min() <= 4
     assert np.isfinite(cost[route[:, 0], route[:, 1]]).all()
 
@@ -69,16 +76,15 @@ def test_enclosed_goal_is_unreachable():
     cost = np.ones((20, 20), np.float32)
     cost[8:13, 8:13] = np.inf
     cost[10, 10] = 1.0
-    field = np.asarray(cost_to_go(jnp.array(cost), jnp.array([10, 10]), jnp.float32(1.0)))
+    field = np.asarray(cost_to_go(moves_over(cost), jnp.array([10, 10])))
     assert np.isfinite(field).sum() == 1
 
 
-def test_coarse_cells_are_blocked_where_the_rover_does_not_fit():
-    cost = jnp.ones((8, 8)).at[3, 3].set(jnp.inf)
-    coarse = np.asarray(coarsen(cost, jnp.full((8, 8), 0.5).at[6, 6].set(0.1), jnp.float32(0.4), 2))
-    assert np.isinf(coarse[1, 1])
-    assert np.isinf(coarse[3, 3])
-    assert np.isfinite(coarse).sum() == 14
+def test_coarse_cells_are_blocked_where_no_wheel_can_stand():
+    cost = jnp.ones((8, 8)).at[3, 3].set(jnp.inf).at[6, 6].set(jnp.inf)
+    coarse = np.asarray(coarsen(cost, jnp.full((8, 8), 0.5).at[6, 6].set(-0.1), 2))
+    assert np.isinf(coarse[1, 1])  # too steep
+    assert np.isfinite(coarse).sum() == 15  # an obstacle in a cell leaves the rest of it
 
 
 def test_a_smoothed_line_keeps_its_ends_and_its_straight_parts():

@@ -23,6 +23,7 @@ from swarmsim.site import ImportOptions, import_site, load_site
 from swarmsim.site.importer import build
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.raster import Grid, edges_on, faces_on, highest
+from swarmsim.site.traversability import at_centres
 
 
 def built(tmp_path, scene, name="yard.glb", turn=None, scale=1.0, **fields):
@@ -33,6 +34,11 @@ def built(tmp_path, scene, name="yard.glb", turn=None, scale=1.0, **fields):
     path = tmp_path / name
     written.export(path)
     return build(path, spec(file=name, **fields))
+
+
+def clear(raw):
+    """Clearance [ny, nx] at the centres of the cells."""
+    return at_centres(raw.clearance, raw.grid)
 
 
 def check_yard(raw):
@@ -47,7 +53,7 @@ def check_yard(raw):
     assert post.centre == pytest.approx((-10, -5, 1.5), abs=0.01)
     column, row = raw.grid.cell_of(np.array([5.0, 3.0])) % 80, raw.grid.cell_of(np.array([5.0, 3.0])) // 80
     assert raw.surface[row, column] == pytest.approx(5.0, abs=1e-3)
-    assert raw.clearance[row, column] == pytest.approx(-3.0, abs=0.3)
+    assert clear(raw)[row, column] == pytest.approx(-3.0, abs=0.3)
 
 
 @pytest.mark.parametrize("suffix", ["glb", "obj", "stl"])
@@ -83,7 +89,7 @@ def test_slope_and_its_cost(tmp_path):
     raw = built(tmp_path, yard(slope=np.tan(np.radians(10))))
     x = raw.grid.centres[..., 0]
     np.testing.assert_allclose(raw.terrain, np.tan(np.radians(10)) * x, atol=2e-3)
-    far = raw.clearance > 4.0
+    far = clear(raw) > 4.0
     tangent = (np.tan(np.radians(10)) / np.tan(np.radians(20))) ** 2
     np.testing.assert_allclose(raw.cost[far], 1 + 2 * tangent, rtol=1e-2)
     steep = built(tmp_path, yard(slope=np.tan(np.radians(25))))
@@ -139,7 +145,7 @@ def test_l_shape_is_split_and_tiny_things_only_count_in_the_rasters(tmp_path):
     assert sum(box.volume for box in raw.boxes) == pytest.approx(building.volume, rel=0.03)
     cell = np.unravel_index(raw.grid.cell_of(np.array([12.0, -10.0])), raw.terrain.shape)
     assert raw.surface[cell] == pytest.approx(0.25, abs=1e-6)
-    assert raw.clearance[cell] < 0.1
+    assert clear(raw)[cell] < 0.1
 
 
 def test_crown_above_a_rover_does_not_stop_it_but_its_trunk_does(tmp_path):
@@ -151,7 +157,7 @@ def test_crown_above_a_rover_does_not_stop_it_but_its_trunk_does(tmp_path):
     scene.add_geometry(block((2.0, 2.0, 0.8), (-10, 0, 0.4)), geom_name="grass")
     raw = built(tmp_path, scene, obstacles=[{"match": "grass", "material": "vegetation", "traversable": True}])
     at = {
-        x: raw.clearance[np.unravel_index(raw.grid.cell_of(np.array([x, 0.25])), raw.terrain.shape)]
+        x: clear(raw)[np.unravel_index(raw.grid.cell_of(np.array([x, 0.25])), raw.terrain.shape)]
         for x in (0.25, 1.25, 10.25, -9.75)
     }
     assert at[0.25] < 0.2
@@ -176,14 +182,14 @@ def test_surface_sampled_anywhere_is_not_below_the_mesh(tmp_path):
     )
     surface = map_coordinates(raw.surface, [at[:, 1], at[:, 0]], order=1)
     assert (surface >= true - 1e-3).all()
-    open_ground = raw.clearance > 1.5
+    open_ground = clear(raw) > 1.5
     np.testing.assert_array_equal(raw.surface[open_ground], raw.terrain[open_ground])
 
 
 def test_zone_bars_the_rover(tmp_path):
     raw = built(tmp_path, yard(), zones=[{"name": "pond", "polygon_m": [[-18, 5], [-12, 5], [-12, 11], [-18, 11]]}])
     inside = np.unravel_index(raw.grid.cell_of(np.array([-15.0, 8.0])), raw.terrain.shape)
-    assert raw.clearance[inside] == pytest.approx(-3.0, abs=0.3)
+    assert clear(raw)[inside] == pytest.approx(-3.0, abs=0.3)
     assert np.isinf(raw.cost[inside])
 
 
@@ -205,7 +211,7 @@ def test_round_outline_is_outside_and_surveyed_within(tmp_path):
     radius = np.linalg.norm(raw.survey_area, axis=1)
     assert radius.max() < 20.0
     assert radius.min() > 17.0
-    assert raw.clearance[0, 0] < 0.0
+    assert clear(raw)[0, 0] < 0.0
 
 
 def test_geotiff_rows_run_north_to_south(tmp_path):

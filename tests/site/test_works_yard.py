@@ -13,6 +13,7 @@ from yards import MATERIALS
 from swarmsim import site as sites
 from swarmsim.config.files import find
 from swarmsim.config.load import load_named
+from swarmsim.policies.routes import at_centres
 from swarmsim.site import load_site, sample
 from swarmsim.site.importer import build
 from tests.generator_scripts import script
@@ -67,7 +68,7 @@ def test_free_air_at_20_m(model):
 
 def test_rover_reaches_the_container_from_its_start_and_drives_around_it(model):
     site = model.site
-    free = np.asarray(site.clearance_m) > 0.6
+    free = np.asarray(at_centres(site.clearance_m, site.terrain_m.shape)) > 0.6
     label, _ = ndimage.label(free & np.isfinite(np.asarray(site.cost)))
 
     def at(xy):

@@ -1,0 +1,119 @@
+"""What the parts of a mesh are: ground, or obstacles of the material that the specification's rules say."""
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmsim.config.errors import Problem, raise_if_any
+from swarmsim.config.names import did_you_mean, one_of
+from swarmsim.config.site import ObstacleMaterial, SiteSpec
+from swarmsim.site.mesh_parts import Part
+from swarmsim.site.obstacles import Box, boxes_of, components
+
+Mask = NDArray[np.bool_]
+
+AIR = "air"  # material of parts painted on others, such as windows, which get no box
+BOXES_MAX = 1024  # the largest are kept: every ray is intersected with every box
+NAMES_SHOWN = 40
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Obstacles of a mesh."""
+
+    boxes: list[Box]
+    materials: list[str]  # of each box
+    passable: list[bool]  # whether a rover can pass each box
+    stops: Mask  # [t] triangles that stop a rover
+
+
+def matches(part: Part, pattern: str) -> bool:
+    """Whether one of a part's names matches a pattern as in a shell, without case."""
+    return any(fnmatchcase(name.casefold(), pattern.casefold()) for name in part.names)
+
+
+def rule_of(part: Part, spec: SiteSpec) -> ObstacleMaterial | None:
+    """The first rule of the specification that matches a part; None where the default applies."""
+    return next((rule for rule in spec.obstacles if matches(part, rule.match)), None)
+
+
+def _rule(part: Part, spec: SiteSpec) -> ObstacleMaterial:
+    default = ObstacleMaterial(match="*", material=spec.default_material, wall_m=spec.default_wall_m)
+    return rule_of(part, spec) or default
+
+
+def check_patterns(parts: list[Part], spec: SiteSpec, path: Path) -> None:
+    """Raise `InputError` for patterns of the specification that match nothing."""
+    names = sorted({name for part in parts for name in part.names})
+    shown = one_of(names[:NAMES_SHOWN]) + (f" … ({len(names)} names)" if len(names) > NAMES_SHOWN else "")
+    given = [("ground", pattern) for pattern in spec.ground] + [("obstacles", rule.match) for rule in spec.obstacles]
+    raise_if_any(
+        [
+            Problem(
+                f"no mesh material or geometry matches '{pattern}' of '{key}'", file=str(path), path=key,
+                given=pattern, allowed=shown, suggestion=did_you_mean(pattern, names),
+            )
+            for key, pattern in given
+            if not any(matches(part, pattern) for part in parts)
+        ]
+    )  # fmt: skip
+
+
+def find_obstacles(parts: list[Part], bare: Mask, spec: SiteSpec) -> Obstacles:
+    """The obstacles among the triangles [t] of the parts that are not ``bare`` ground."""
+    boxes: list[Box] = []
+    names: list[str] = []
+    passable: list[bool] = []
+    stops = ~bare
+    start = 0
+    for part in parts:
+        span = slice(start, start + len(part.triangles))
+        start = span.stop
+        rule = _rule(part, spec)
+        stops[span] &= not rule.traversable
+        own = part.triangles[~bare[span]] if rule.material != AIR else part.triangles[:0]
+        for piece in components(part.vertices, own) if len(own) else ():
+            found = boxes_of(part.vertices[own[piece]], rule.wall_m)
+            boxes += found
+            names += [rule.material] * len(found)
+            passable += [rule.traversable] * len(found)
+    return Obstacles(boxes, names, passable, stops)
+
+
+def described(parts: list[Part], bare: Mask, spec: SiteSpec) -> list[dict[str, Any]]:
+    """What each part was taken for, as plain values: its names, triangles, ``is`` and whether a ``rule`` says so."""
+    edges = np.cumsum([len(part.triangles) for part in parts])[:-1]
+    found = []
+    for part, mask in zip(parts, np.split(bare, edges), strict=True):
+        ground = bool(mask.mean() > 0.5)
+        found.append(
+            {
+                "names": list(part.names),
+                "triangles": len(part.triangles),
+                "is": "ground" if ground else _rule(part, spec).material,
+                "rule": ground or rule_of(part, spec) is not None,
+            }
+        )
+    return found
+
+
+def unnamed_told(parts: list[dict[str, Any]], spec: SiteSpec) -> list[str]:
+    """A warning of the obstacles that no rule names; ``parts`` as of `described`."""
+    names = list(
+        dict.fromkeys(part["names"][0] if part["names"] else "without a name" for part in parts if not part["rule"])
+    )
+    if not names:
+        return []
+    shown = ", ".join(names[:NAMES_SHOWN]) + (
+        f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    )
+    how = "solid" if spec.default_wall_m is None else f"in shells of {spec.default_wall_m:g} m"
+    return [
+        f"taken as {spec.default_material}, {how} (default_material, default_wall_m), since no rule names them: "
+        f"{shown}. To say what they are, add to 'obstacles:' in site.yaml, e.g. "
+        f"- {{match: '{names[0]}', material: steel, wall_m: 0.002}}"
+    ]
