@@ -63,7 +63,8 @@ def run(
     missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1_000_000))] = 1,
     overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
     force: bool = False,
-) -> None:
+    strict: bool = False,
+) -> int:
     """Fly a mission, or many at once, and write the results.
 
     For example:
@@ -72,6 +73,7 @@ def run(
         swarmsim run recon --missions 256
         swarmsim run recon --set phases.survey.settings.altitude_m=30 --set wind.speed_m_s=5
         swarmsim run runs/recon/scenario.yaml --out runs/again
+        swarmsim run recon --strict
 
     Parameters
     ----------
@@ -88,10 +90,13 @@ def run(
         index or by their name, e.g. vehicles.uav1.heading_deg=90.
     force
         Replace the results of an earlier run.
+    strict
+        End with 3 where a mission's status is neither located nor none. (2 is wrong input.)
     """
     from swarmsim.cli.run import run_scenario
 
-    run_scenario(scenario, out, seed, missions, overrides, force)
+    certain = run_scenario(scenario, out, seed, missions, overrides, force)
+    return 3 if strict and not certain else 0
 
 
 @command
@@ -307,12 +312,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"the working folder cannot be used ({error.strerror}): change to another one\n")
         return EXIT_INPUT
     try:
-        app(
+        code = app(
             sys.argv[1:] if arguments is None else list(arguments),
             exit_on_error=False,
             print_error=False,
-            result_action="return_none",
+            result_action="return_value",
         )
+        return code if isinstance(code, int) else 0
     except CycloptsError as error:
         sys.stderr.write(f"{error}\n\nSee 'swarmsim --help' and 'swarmsim COMMAND --help'.\n")
         return EXIT_INPUT

@@ -43,8 +43,11 @@ _TIME_ROWS = (
 
 def run_scenario(
     name: str, out: Path | None, seed: int | None, missions: int, overrides: Sequence[str], force: bool
-) -> None:
-    """Fly ``missions`` missions of the scenario and print their summary; nothing is written when the input is wrong."""
+) -> bool:
+    """Fly ``missions`` missions of the scenario and print their summary; nothing is written when the input is wrong.
+
+    Returns whether every mission has an answer that it stands behind (`swarmsim.results.status.CERTAIN`).
+    """
     from swarmsim.config.scenario import load_scenario
 
     scenario = load_scenario(name, overrides, seed)
@@ -68,10 +71,15 @@ def run_scenario(
     with RichProgress(Console(stderr=True), missions) as progress:
         run(scenario, folder, missions, progress, force=force)
     console = Console()
-    console.print(summary_table(read_summary(folder), scenario.mission.name, missions))
+    summary = read_summary(folder)
+    console.print(summary_table(summary, scenario.mission.name, missions))
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
     if (folder / RECORDING).is_file():
         console.print(f"Watch:   swarmsim view {folder}", highlight=False, soft_wrap=True)
+    from swarmsim.results.status import CERTAIN
+
+    statuses = summary.get("statuses", {summary.get("status"): 1})
+    return all(status in CERTAIN for status in statuses)
 
 
 def bench_scenario(name: str, missions: int, repeats: int, overrides: Sequence[str]) -> None:
@@ -146,6 +154,7 @@ def summary_table(summary: dict[str, Any], name: str, missions: int = 1) -> Tabl
         for path, number in _leaves(summary, ""):
             table.add_row(path, value_text(number), "")
         return table
+    table.add_row("Status", summary["status"].replace("_", " "))
     table.add_row("Finding", summary["finding"])
     for warning in summary["warnings"]:
         table.add_row("Warning", warning)

@@ -67,6 +67,7 @@ class SourceFit:
     detection: jax.Array  # [] twice their difference: generalised likelihood ratio, see `detected`
     reduced_deviance: jax.Array  # [] about 1 for a model that describes the counts; tens: a local optimum, more sources
     effective_samples: jax.Array  # [] number of independent places that the posterior's weighted ones are worth
+    windows: jax.Array  # [] number of valid ones
     converged: jax.Array  # [] bool: those are enough for a mean, and the place is within the site
 
 
@@ -188,5 +189,6 @@ def _report(
         detection=jnp.maximum(2.0 * (best.log_likelihood - without_source), 0.0),
         reduced_deviance=-2.0 * best.log_likelihood / jnp.maximum(jnp.sum(problem.measurements.valid) - 5, 1),
         effective_samples=posterior.effective,
+        windows=jnp.sum(problem.measurements.valid),
         converged=(posterior.effective >= ENOUGH_EFFECTIVE) & inside,
     )

@@ -8,6 +8,7 @@ G (`swarmsim.radiation.cylinder`), and the scattered counts of `swarmsim.radiati
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from swarmsim.radiation.cylinder import direction_basis, near_ratio
 from swarmsim.radiation.detector import SPECTRUM_DEPTHS, Detector, Source
@@ -87,6 +88,17 @@ def observed_rate(detector: Detector, net_cps: jax.Array) -> jax.Array:
     """
     rate = net_cps + detector.background_cps
     return rate * jnp.exp(-rate * detector.paralyzable_s) / (1.0 + rate * detector.non_paralyzable_s)
+
+
+def highest_rate(detector: Detector) -> float:
+    """Largest rate that the detector can show; inf without dead time (host)."""
+    paralyzable, non_paralyzable = float(detector.paralyzable_s), float(detector.non_paralyzable_s)
+    if paralyzable <= 0.0:
+        return np.inf if non_paralyzable <= 0.0 else 1.0 / non_paralyzable
+    # the derivative of log m vanishes where n t_p (1 + n t_n) = 1
+    a, b = paralyzable * non_paralyzable, paralyzable
+    n = 1.0 / b if a == 0.0 else (-b + np.sqrt(b * b + 4.0 * a)) / (2.0 * a)
+    return float(n * np.exp(-n * paralyzable) / (1.0 + n * non_paralyzable))
 
 
 def exposure_of(detector: Detector, live_s: jax.Array | float) -> jax.Array:

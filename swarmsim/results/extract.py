@@ -8,6 +8,7 @@ import numpy as np
 
 from swarmsim.estimation import SourceFit
 from swarmsim.missions.state import MissionState
+from swarmsim.radiation.rate import highest_rate
 from swarmsim.results.record import (
     Estimate,
     Event,
@@ -20,10 +21,14 @@ from swarmsim.results.record import (
     TrueSource,
     VehicleRecord,
 )
+from swarmsim.results.status import Diagnostics, Verdict, assess
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
+from swarmsim.site.model import height_at
 from swarmsim.world.model import World
 
+LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
+"""Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
 NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"
 SAMPLE = ("time_s", "position_m", "counts", "exposure_s")
@@ -46,15 +51,20 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         survey_estimate = _estimate(conclusion.survey.fit, nuclides[presumed])
         estimate = _estimate(conclusion.fit, nuclides[int(conclusion.nuclide)])
         spectrum = _spectrum(simulation, conclusion)
+    samples = _samples(simulation, batch, index, phases)
+    chart = None if conclusion is None else _map(simulation, conclusion.survey)
+    verdict = None
+    if conclusion is not None and chart is not None:
+        verdict = _verdict(simulation, samples, chart, conclusion, survey_estimate, estimate)
     return MissionRecord(
         name=simulation.scenario.mission.name,
         site=simulation.site_model.name,
         seed=int(batch.seeds[index]),
         phases=tuple(phases),
         vehicles=tuple(vehicles),
-        samples=_samples(simulation, batch, index, phases),
+        samples=samples,
         sought=_sought(simulation),
-        map=None if conclusion is None else _map(simulation, conclusion.survey),
+        map=chart,
         survey_estimate=survey_estimate,
         surveyed_s=_surveyed_s(simulation, end),
         estimate=estimate,
@@ -62,7 +72,9 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         sources=true_sources(simulation, batch.worlds.of(index)),
         paths_m=_paths(simulation, end),
         events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
-        finding=_finding(conclusion is not None, estimate, spectrum, _no_way(simulation, end)),
+        finding=_finding(verdict, estimate, spectrum, _no_way(simulation, end)),
+        status="not_sought" if verdict is None else verdict.status,
+        covered=None if verdict is None else verdict.covered,
         warnings=(CROWDED,) if bool(end.world.crowded) else (),
     )
 
@@ -215,9 +227,9 @@ def _nuclides(simulation: Simulation) -> tuple[str, ...]:
 def _estimate(fit: SourceFit, nuclide: str) -> Estimate:
     return Estimate(
         position_m=np.asarray(fit.position_m),
-        covariance_m2=np.asarray(fit.covariance_m2),
+        covariance_m2=np.asarray(fit.covariance_m2) + LEAST_STD_M**2 * np.eye(3),
         activity_mbq=float(fit.activity_bq) * 1e-6,
-        activity_std_mbq=float(fit.activity_std_bq) * 1e-6,
+        activity_std_mbq=float(np.hypot(fit.activity_std_bq, LEAST_STD_SHARE * fit.activity_bq)) * 1e-6,
         background_scale=float(fit.background_scale),
         nuclide=nuclide,
     )
@@ -287,9 +299,54 @@ def _no_way(simulation: Simulation, end: MissionState) -> bool:
     return bool(drives) and not any(drives)
 
 
-def _finding(sought: bool, estimate: Estimate | None, spectrum: Spectrum | None, no_way: bool) -> str:
-    if not sought:
+def _verdict(
+    simulation: Simulation,
+    samples: Samples,
+    chart: RadiationMap,
+    conclusion: Any,
+    aerial: Estimate | None,
+    final: Estimate | None,
+) -> Verdict:
+    """Status of the mission's answer."""
+    fit, detectors = conclusion.fit, simulation.plan.detectors
+    used = np.full(len(simulation.scenario.members), -1)
+    for group in simulation.world.groups:
+        if group.counter is not None:
+            used[list(group.member)] = group.counter.index
+    of_vehicle = used[samples.vehicle]
+    highest = np.array([highest_rate(detector) for detector in detectors])
+    background = np.array([float(detector.background_cps) for detector in detectors])
+    diagnostics = Diagnostics(
+        reduced_deviance=float(fit.reduced_deviance),
+        windows=int(fit.windows),
+        effective_samples=float(fit.effective_samples),
+        converged=bool(fit.converged),
+        detection=float(fit.detection),
+    )
+    ground = height_at(simulation.site_model.site, np.asarray(samples.position_m, float)[:, :2])
+    return assess(
+        samples,
+        chart,
+        (highest[of_vehicle], background[of_vehicle]),
+        ground,
+        final is not None,
+        diagnostics,
+        aerial,
+        final,
+    )
+
+
+def _finding(verdict: Verdict | None, estimate: Estimate | None, spectrum: Spectrum | None, no_way: bool) -> str:
+    """What was found, and why it is not to be believed where it is not."""
+    if verdict is None:
         return NOTHING_SOUGHT
+    found = _found(estimate, spectrum, no_way)
+    if not verdict.reasons:
+        return found
+    return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
+
+
+def _found(estimate: Estimate | None, spectrum: Spectrum | None, no_way: bool) -> str:
     if estimate is None:
         return NOTHING_FOUND
     x, y = estimate.position_m[:2]

@@ -160,6 +160,8 @@ class MissionRecord:
     paths_m: dict[int, Floats]  # last planned path [r, 3] of a vehicle by its index
     events: tuple[Event, ...]
     finding: str  # one sentence: what the mission found
+    status: str = "not_sought"  # what that is worth, see `swarmsim.results.status.Status`
+    covered: float | None = None  # share of the survey area that was measured; None where nothing was sought
     warnings: tuple[str, ...] = ()  # what makes parts of the result doubtful
 
     def phase(self, name: str) -> Phase | None:

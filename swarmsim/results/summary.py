@@ -1,5 +1,6 @@
 """What a mission found and how far it was from the truth, in plain numbers: one mission's summary, and a batch's."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -67,7 +68,9 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "name": record.name,
         "site": record.site,
         "seed": int(record.seed),
+        "status": record.status,
         "finding": record.finding,
+        "covered": record.covered,
         "warnings": list(record.warnings),
         "success": succeeded(record),
         "phases": {phase.name: phase_summary(record, phase) for phase in record.phases},
@@ -223,7 +226,7 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     A phase that did not begin has no columns.
     """
     record = record.finite()
-    row: dict[str, Any] = {"seed": int(record.seed), "finding": record.finding}
+    row: dict[str, Any] = {"seed": int(record.seed), "status": record.status, "finding": record.finding}
     for phase in record.phases:
         row |= {f"{phase.name}_{key}": value for key, value in _measured(record, phase).items()}
     row["duration_s"] = float(record.end_s)
@@ -253,8 +256,9 @@ def _axes(name: str, values: list[float] | None, axes: tuple[str, ...]) -> dict[
 def succeeded(record: MissionRecord) -> bool:
     """Whether the mission did what it was for: no crash, no failsafe, no phase out of time, and the answer is right.
 
-    Right is a source located and, where the mission identifies nuclides, the nuclide of the nearest true source named;
-    or, where there is no source, none located. A mission that looks for nothing has no answer to give.
+    Right is a source located, with that status, and, where the mission identifies nuclides, the nuclide of the nearest
+    true source named; or, where there is no source, the status "none". A mission that looks for nothing has no answer
+    to give.
     """
     if any(v.crashed for v in record.vehicles) or not all(phase.in_time for phase in record.phases):
         return False
@@ -264,7 +268,9 @@ def succeeded(record: MissionRecord) -> bool:
         return True
     active = tuple(s for s in record.sources if s.activity_mbq > 0.0)
     if not active or record.estimate is None:
-        return not active and record.estimate is None
+        return not active and record.status == "none"
+    if record.status != "located":
+        return False
     if record.sought == "source":
         return True
     nearest, _ = _nearest(np.asarray(record.estimate.position_m, float), active)
@@ -297,6 +303,7 @@ def batch_summary(rows: Sequence[dict[str, Any]], records: Sequence[MissionRecor
         "seed_first": min(seeds),
         "seed_last": max(seeds),
         "success_rate": float(np.mean([row["success"] for row in rows])),
+        "statuses": dict(Counter(row["status"] for row in rows)),
         "crashed_vehicles": int(sum(row["crashed"] for row in rows)),
         "failsafe_vehicles": int(sum(row["failsafes"] for row in rows)),
         "metrics": numbers,

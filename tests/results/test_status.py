@@ -1,0 +1,88 @@
+"""What an answer is worth: each status from the diagnostics that lead to it."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from swarmsim.results.record import Estimate, RadiationMap, Samples
+from swarmsim.results.status import CERTAIN, Diagnostics, assess, coverage
+
+GOOD = Diagnostics(reduced_deviance=1.0, windows=400, effective_samples=80.0, converged=True, detection=900.0)
+SIDE_M, HEIGHT_M = 60.0, 20.0
+
+
+def chart(hotspots=((0.0, 0.0),)) -> RadiationMap:
+    cells = np.zeros((31, 31))
+    return RadiationMap(np.array([-30.0, -30.0]), 2.0, cells, cells + 1.0, np.array(hotspots, float).reshape(-1, 2))
+
+
+def survey(rate: float = 120.0, share: float = 1.0) -> Samples:
+    """Samples on lines 10 m apart over the first ``share`` of the area."""
+    y = np.arange(-30.0, 31.0, 10.0)
+    x = np.linspace(-30.0, -30.0 + share * SIDE_M, 60)
+    place = np.array([(a, b, HEIGHT_M) for b in y for a in x])
+    n = len(place)
+    return Samples(
+        vehicle=np.zeros(n, np.int32), phase=np.full(n, "survey"), time_s=np.arange(n) * 1.0, position_m=place,
+        counts=np.full(n, rate), exposure_s=np.ones(n), count_rate_cps=np.full(n, rate),
+    )  # fmt: skip
+
+
+def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide: str = "Co-60") -> Estimate:
+    covariance = np.diag([std**2, std**2, 0.25])
+    return Estimate(np.array([x, 0.0, 1.0]), covariance, activity, 0.05 * activity, 1.0, nuclide)
+
+
+def verdict(samples=None, hotspots=((0.0, 0.0),), found=True, diagnostics=GOOD, aerial=None, final=None, highest=184e3):
+    samples = survey() if samples is None else samples
+    n = len(samples.counts)
+    limits = (np.full(n, highest), np.full(n, 94.0))
+    return assess(
+        samples, chart(hotspots), limits, np.zeros(n), found, diagnostics,
+        (aerial or estimate(1.0)) if found else None, (final or estimate()) if found else None,
+    )  # fmt: skip
+
+
+def test_a_good_answer_has_no_reasons() -> None:
+    assert verdict().status == "located"
+    assert verdict().reasons == ()
+    assert verdict(found=False).status == "none"
+    assert {"located", "none"} <= set(CERTAIN)
+
+
+@pytest.mark.parametrize(
+    ("given", "status", "said"),
+    [
+        ({"samples": survey(share=0.3), "found": False}, "incomplete_survey", r"only \d\d% of the survey area"),
+        ({"samples": survey(rate=150e3)}, "saturated", "dead time"),
+        ({"samples": survey(rate=2.0)}, "saturated", "dead time"),
+        ({"diagnostics": replace(GOOD, reduced_deviance=2.0)}, "inconsistent", "reduced deviance 2.0"),
+        ({"aerial": estimate(12.0, std=1.0)}, "inconsistent", "12 m apart"),
+        ({"final": estimate(activity=19e6)}, "inconsistent", "times"),
+        ({"diagnostics": replace(GOOD, converged=False, effective_samples=2.0)}, "detected", "did not settle"),
+        ({"final": estimate(std=14.0)}, "detected", "known to 14 m"),
+        ({"hotspots": ((0.0, 0.0), (-28.0, 0.0))}, "ambiguous", "further sources"),
+    ],
+)
+def test_each_doubt_has_its_status_and_sentence(given, status: str, said: str) -> None:
+    found = verdict(**given)
+    assert found.status == status
+    assert found.status not in CERTAIN
+    assert any(re.search(said, reason) for reason in found.reasons)
+
+
+def test_the_gravest_doubt_decides_and_all_are_told() -> None:
+    both = verdict(diagnostics=replace(GOOD, reduced_deviance=9.0), hotspots=((0.0, 0.0), (-28.0, 0.0)))
+    assert both.status == "inconsistent"
+    assert len(both.reasons) == 2
+
+
+def test_coverage_is_the_share_of_the_area_near_a_measurement() -> None:
+    assert coverage(survey(), chart(), np.zeros(7 * 60)) == 1.0
+    half = coverage(survey(share=0.25), chart(), np.zeros(7 * 60))
+    assert half == pytest.approx(0.25 + HEIGHT_M / SIDE_M, abs=0.06)
+    on_ground = replace(survey(), position_m=survey().position_m * [1, 1, 0])
+    assert coverage(on_ground, chart(), np.zeros(7 * 60)) > 0.95
+    assert coverage(survey().rows(slice(0, 0)), chart(), np.zeros(0)) == 0.0
