@@ -270,6 +270,8 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
         paths_m={3: route} if found else {},
         events=tuple(Event(survey_end - 2.0 + 0.3 * k, f"uav{k + 1}", "finished", done) for k in range(3)),
         finding="Co-60 source found." if found else "No source above background.",
+        status="located" if found else "none",
+        covered=1.0,
     )
 
 

@@ -22,6 +22,10 @@ ELEMENTS = frozenset(
 """Symbols of the elements with cross sections."""
 
 
+ROIS_KEV = (30.0, 60.0, 95.0, 140.0, 200.0, 270.0, 340.0, 430.0, 570.0, 760.0, 1050.0, 1260.0, 1400.0, 1650.0, 3000.0)
+"""Edges of the regions of interest: the peaks of Am-241, Co-57, I-131, 511 keV, Cs-137, Co-60 and K-40 are apart."""
+
+
 class Line(Model):
     """One gamma or X-ray line: photon energy and photons per hundred decays."""
 
@@ -133,15 +137,21 @@ class Background(Model):
 
 
 class Spectrometer(Model):
-    """Multichannel analyser of a detector."""
+    """Multichannel analyser of a detector.
+
+    ``rois_kev`` are the edges of the regions of interest whose counts come with every reading.
+    """
 
     channels: int = Field(ge=64, le=16_384)
     energy_max_kev: float = Field(ge=100, le=100_000)
     threshold_kev: PhotonEnergy
+    rois_kev: tuple[PhotonEnergy, ...] = Field(default=ROIS_KEV, min_length=2, max_length=33)
     resolution_percent_at_662_kev: float = Field(ge=0.01, le=50)
 
     @model_validator(mode="after")
-    def _threshold_below_end(self) -> "Spectrometer":
+    def _consistent(self) -> "Spectrometer":
+        if any(b <= a for a, b in pairwise(self.rois_kev)):
+            raise ValueError("the edges rois_kev must increase")
         if self.threshold_kev >= self.energy_max_kev:
             raise ValueError("threshold_kev must lie below energy_max_kev")
         return self

@@ -18,6 +18,7 @@ class Measurements:
     exposure_s: jax.Array  # [n] s, live time that the counts stand for
     valid: jax.Array  # [n] bool
     detector: jax.Array  # [n] int32, index into the tuple of detectors (UAV, rover)
+    rois: jax.Array | None = None  # [n, R] the counts by region of interest
 
 
 def aggregate(measurements: Measurements, per_window: int) -> Measurements:
@@ -66,11 +67,15 @@ def aggregate(measurements: Measurements, per_window: int) -> Measurements:
         exposure_s=total,
         valid=jnp.any(m.valid, axis=1),
         detector=jnp.take_along_axis(m.detector, first[:, None], axis=1)[:, 0],
+        rois=None if m.rois is None else jnp.sum(m.rois, axis=1),
     )
 
 
 def concatenate(*parts: Measurements) -> Measurements:
-    """Measurements of several vehicles or phases after one another; leading axes (vehicle, sample) are flattened."""
+    """Measurements of several vehicles or phases after one another; leading axes (vehicle, sample) are flattened.
+
+    Regions of interest are padded with zeros to the largest number of them, and left out where a part has none.
+    """
 
     def flat(x: jax.Array, trailing: int) -> jax.Array:
         return x.reshape(-1, *x.shape[x.ndim - trailing :]) if trailing else x.reshape(-1)
@@ -79,8 +84,14 @@ def concatenate(*parts: Measurements) -> Measurements:
         return jnp.concatenate([flat(leaf, trailing) for leaf in leaves])
 
     vectors = ("position_m", "travel_m", "axis")
-    names = Measurements.__dataclass_fields__  # type: ignore[attr-defined]
-    return Measurements(**{f: join(*(getattr(p, f) for p in parts), trailing=int(f in vectors)) for f in names})
+    names = set(Measurements.__dataclass_fields__) - {"rois"}  # type: ignore[attr-defined]
+    fields = {f: join(*(getattr(p, f) for p in parts), trailing=int(f in vectors)) for f in names}
+    regions = [part.rois for part in parts if part.rois is not None]
+    if len(regions) < len(parts):
+        return Measurements(**fields)
+    most = max(rois.shape[-1] for rois in regions)
+    padded = [jnp.pad(rois, [(0, 0)] * (rois.ndim - 1) + [(0, most - rois.shape[-1])]) for rois in regions]
+    return Measurements(**fields, rois=join(*padded, trailing=1))
 
 
 def cleared(m: Measurements) -> Measurements:
@@ -97,4 +108,5 @@ def cleared(m: Measurements) -> Measurements:
         exposure_s=jnp.where(valid, m.exposure_s, 0.0),
         valid=valid,
         detector=jnp.where(valid, m.detector, 0),
+        rois=None if m.rois is None else jnp.where(valid[:, None], m.rois, 0.0),
     )

@@ -18,9 +18,10 @@ class Windows:
     axis: jax.Array  # [U, W, 3] sum over samples of exposure times crystal axis, world
     counts: jax.Array  # [U, W]
     exposure_s: jax.Array  # [U, W]
+    rois: jax.Array  # [U, W, R] the counts by region of interest
 
 
-def windows_start(vehicles: int, windows: int) -> Windows:
+def windows_start(vehicles: int, windows: int, rois: int) -> Windows:
     """Nothing measured yet."""
     scalars, vectors = jnp.zeros((vehicles, windows)), jnp.zeros((vehicles, windows, 3))
     return Windows(
@@ -31,6 +32,7 @@ def windows_start(vehicles: int, windows: int) -> Windows:
         axis=vectors,
         counts=scalars,
         exposure_s=scalars,
+        rois=jnp.zeros((vehicles, windows, rois)),
     )
 
 
@@ -63,6 +65,7 @@ def gather(windows: Windows, samples: Measurements, new: jax.Array, per_window: 
         axis=add(windows.axis, exposure[..., None] * samples.axis),
         counts=add(windows.counts, samples.counts),
         exposure_s=add(windows.exposure_s, exposure),
+        rois=windows.rois if samples.rois is None else add(windows.rois, samples.rois),
     )
 
 
@@ -81,5 +84,6 @@ def measured(windows: Windows, detector: int) -> Measurements:
         exposure_s=windows.exposure_s,
         valid=valid,
         detector=jnp.full(valid.shape, detector, jnp.int32),
+        rois=windows.rois,
     )
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), each)

@@ -34,7 +34,9 @@ def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionStat
     """Every vehicle at rest at its start, no phase begun."""
     state = reset(world, key, active=False)
     windows = tuple(
-        windows_start(group.size, size) if size else None
+        windows_start(group.size, size, group.counter.detector.background_rois.shape[0])
+        if size and group.counter is not None
+        else None
         for group, size in zip(world.groups, plan.windows, strict=True)
     )
     mission = MissionState(

@@ -40,6 +40,7 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     mission = _learned(world, plan, mission, samples)
     mission, signals = decide(world, plan, mission)
     ends = first + timing.log_ticks * (1 + jnp.arange(logs))
+    samples = tuple(None if s is None else replace(s, rois=None) for s in samples)  # they are in the windows
     return mission, Log(time_s=ends * period_s, tracks=tracks, samples=samples), signals
 
 
@@ -100,6 +101,7 @@ def _samples(mission: MissionState, after_s: jax.Array) -> tuple[Sampled | None,
                 axis=reading.axis,
                 counts=reading.counts,
                 exposure_s=reading.exposure_s,
+                rois=reading.rois,
                 new=reading.valid & (reading.time_s > after_s),
             )
         )
@@ -134,6 +136,7 @@ def _measurements(sampled: Sampled) -> Measurements:
         axis=sampled.axis,
         counts=sampled.counts,
         exposure_s=sampled.exposure_s,
+        rois=sampled.rois,
         valid=sampled.new,
         detector=jnp.zeros(sampled.counts.shape, jnp.int32),
     )

@@ -82,6 +82,7 @@ class Sampled:
     axis: jax.Array  # [F, U, 3]
     counts: jax.Array  # [F, U]
     exposure_s: jax.Array  # [F, U]
+    rois: jax.Array | None  # [F, U, R] counts by region of interest; not kept in the log
     new: jax.Array  # [F, U] bool: one ended in this period, and it is valid
 
 

@@ -7,7 +7,16 @@ from swarmsim.radiation.detector import KINDS, Detector, Source, build_detector,
 from swarmsim.radiation.dose import build_dosimeter
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.library import Library, load_library
-from swarmsim.radiation.rate import draw_counts, exposure_of, line_rates, net_rate, observed_rate, spectrum_rate
+from swarmsim.radiation.rate import (
+    draw_counts,
+    exposure_of,
+    line_rates,
+    net_rate,
+    observed_rate,
+    observed_rois,
+    roi_rates,
+    spectrum_rate,
+)
 
 __all__ = [
     "KINDS",
@@ -24,6 +33,8 @@ __all__ = [
     "load_library",
     "net_rate",
     "observed_rate",
+    "observed_rois",
     "restrict",
+    "roi_rates",
     "spectrum_rate",
 ]

@@ -59,6 +59,9 @@ class Detector:
     peak_spectrum: jax.Array  # [N, L, channels] share of the counts of unscattered photons in each channel, sums to 1
     scattered_bins: jax.Array  # [N, depths, M, L, SPECTRUM_BINS] share of the scattered counts in each bin, sums to 1
     bin_spectrum: jax.Array  # [SPECTRUM_BINS, channels] spectra of photons of those bins, each sums to 1
+    peak_rois: jax.Array  # [N, L, R] the spectra above added up in the regions of interest
+    scattered_rois: jax.Array  # [N, depths, M, L, R] share of the scattered counts in each
+    background_rois: jax.Array  # [R] cps, sums to background_cps
     background_spectrum: jax.Array  # [channels] cps, sums to background_cps
     energy_kev: jax.Array  # [channels] centre of each channel
     line_energy_kev: jax.Array  # [N, L]
@@ -120,7 +123,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         nuclide_names=library.nuclide_names,
         material_names=library.material_names,
         kind=kind,
-        **_spectra(spec, response, energy),
+        **_spectra(spec, response, energy, bins),
     )
 
 
@@ -134,9 +137,12 @@ def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
         raise InputError.of(f"unknown nuclides {missing}", allowed="one of " + ", ".join(detector.nuclide_names))
     rows = np.array([detector.nuclide_names.index(name) for name in nuclides])
     lines = int(np.max(np.sum(np.asarray(detector.yields)[rows] > 0, axis=1)))
-    per_line = ("yields", "effective_area_m2", "near_share", "attenuation_1_m", "peak_spectrum", "line_energy_kev")
-    tables = {name: getattr(detector, name)[rows, :lines] for name in per_line}
-    tables |= {name: getattr(detector, name)[rows][..., :lines, :] for name in ("scatter_1_m", "scattered_bins")}
+    second = (
+        "yields", "effective_area_m2", "near_share", "attenuation_1_m", "peak_spectrum", "peak_rois", "line_energy_kev",
+    )  # fmt: skip
+    last_but_one = ("scatter_1_m", "scattered_bins", "scattered_rois")
+    tables = {name: getattr(detector, name)[rows, :lines] for name in second}
+    tables |= {name: getattr(detector, name)[rows][..., :lines, :] for name in last_but_one}
     return replace(detector, nuclide_names=nuclides, **tables)
 
 
@@ -232,26 +238,43 @@ def spectrum_edges() -> Floats:
     return np.geomspace(scattering.CUT_KEV, 3000.0, SPECTRUM_BINS + 1)
 
 
-def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats) -> dict[str, Any]:
+def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins: Floats) -> dict[str, Any]:
     """The fields of a detector that have channels; a counter without energy resolution has one channel."""
     f32 = on_device
     if response is None:
         return {
             "peak_spectrum": f32(np.ones((*energy.shape, 1))),
             "bin_spectrum": f32(np.ones((SPECTRUM_BINS, 1))),
+            "peak_rois": f32(np.ones((*energy.shape, 1))),
+            "scattered_rois": f32(np.ones((*bins.shape[:-1], 1))),
+            "background_rois": f32(np.array([spec.background.rate_cps])),
             "background_spectrum": f32(np.array([spec.background.rate_cps])),
             "energy_kev": f32(np.array([662.0])),
             "identification_bins": (),
         }
+    assert spec.spectrometer is not None
     flat, back = np.unique(energy, return_inverse=True)
     edges = spectrum_edges()
+    peaks = normalised(line_spectra(response, flat))
+    of_bins = normalised(line_spectra(response, np.sqrt(edges[1:] * edges[:-1])))
+    background = background_spectrum(response, spec.background)
+    rois = _rois(response, spec.spectrometer.rois_kev)
     return {
-        "peak_spectrum": f32(normalised(line_spectra(response, flat))[back].reshape(*energy.shape, -1)),
-        "bin_spectrum": f32(normalised(line_spectra(response, np.sqrt(edges[1:] * edges[:-1])))),
-        "background_spectrum": f32(background_spectrum(response, spec.background)),
+        "peak_spectrum": f32(peaks[back].reshape(*energy.shape, -1)),
+        "bin_spectrum": f32(of_bins),
+        "peak_rois": f32((peaks @ rois)[back].reshape(*energy.shape, -1)),
+        "scattered_rois": f32(bins @ of_bins @ rois),
+        "background_rois": f32(background @ rois),
+        "background_spectrum": f32(background),
         "energy_kev": f32(response.channel_centre_kev),
         "identification_bins": _identification_bins(response),
     }
+
+
+def _rois(response: Response, edges_kev: tuple[float, ...]) -> Floats:
+    """Which channel belongs to which region [channels, R]; those below the first and above the last go to these."""
+    number = np.clip(np.searchsorted(edges_kev, response.channel_centre_kev) - 1, 0, len(edges_kev) - 2)
+    return np.eye(len(edges_kev) - 1)[number]
 
 
 def _identification_bins(response: Response) -> tuple[int, ...]:

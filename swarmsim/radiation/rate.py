@@ -113,9 +113,12 @@ def exposure_of(detector: Detector, live_s: jax.Array | float) -> jax.Array:
 def draw_counts(
     detector: Detector, key: jax.Array, mean_observed_cps: jax.Array, live_s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts of one measurement and the exposure in s that they represent, both []: Poisson(rate x exposure)."""
-    exposure = exposure_of(detector, live_s)
-    return poisson(key, mean_observed_cps * exposure), exposure
+    """Counts [...] of one measurement and the exposure [] in s that they represent: Poisson(rate x exposure)."""
+    exposure, mean = exposure_of(detector, live_s), jnp.asarray(mean_observed_cps)
+    if mean.ndim == 0:
+        return poisson(key, mean * exposure), exposure
+    keys = jax.random.split(key, mean.shape[0])
+    return jax.vmap(poisson)(keys, mean * exposure), exposure
 
 
 def spectrum_rate(
@@ -128,14 +131,33 @@ def spectrum_rate(
     return direct @ detector.peak_spectrum[source.nuclide] + bins @ detector.bin_spectrum
 
 
+def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array) -> jax.Array:
+    """Counts per second in each region of interest [R] that ``source`` adds; they sum to `net_rate`."""
+    direct, scattered = line_rates(detector, source, way, position_m, axis)
+    shares = _shares(detector, source.nuclide, way, detector.scattered_rois)
+    return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares)
+
+
+def observed_rois(detector: Detector, net_cps: jax.Array) -> jax.Array:
+    """Counts per second [..., R] after dead time of net rates [..., R], background included (`observed_rate`)."""
+    true = net_cps + detector.background_rois
+    total = jnp.sum(true, axis=-1)
+    shown = observed_rate(detector, total - detector.background_cps)
+    return true * (shown / jnp.maximum(total, 1e-30))[..., None]
+
+
 def scattered_shares(detector: Detector, nuclide: jax.Array, way: Crossed) -> jax.Array:
     """Shares [L, bins] of the scattered counts by energy: means over the layers, between the tabulated depths."""
+    return _shares(detector, nuclide, way, detector.scattered_bins)
+
+
+def _shares(detector: Detector, nuclide: jax.Array, way: Crossed, tables: jax.Array) -> jax.Array:
     layers = detector.attenuation_1_m[nuclide] * way.length_m  # [L, M]
     depth = jnp.sum(layers, axis=1)
     first, last = SPECTRUM_DEPTHS
     deep = jnp.clip((depth - first) / (last - first), 0.0, 1.0)
     weight = jnp.where(depth[:, None] > 1e-6, layers / jnp.maximum(depth, 1e-6)[:, None], 1.0 / layers.shape[1])
-    table = detector.scattered_bins[nuclide]  # [depths, M, L, bins]
+    table = tables[nuclide]  # [depths, M, L, bins]
     mean = jnp.einsum("lm,dmlb->dlb", weight, table)
     shares = (1.0 - deep)[:, None] * mean[0] + deep[:, None] * mean[1]
     return shares / jnp.maximum(jnp.sum(shares, axis=1, keepdims=True), 1e-12)

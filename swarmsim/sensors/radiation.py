@@ -11,7 +11,7 @@ from swarmsim import randomness
 from swarmsim.physics.rotations import rotate
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.rate import draw_counts, exposure_of, net_rate, observed_rate
+from swarmsim.radiation.rate import draw_counts, exposure_of, observed_rois, roi_rates
 from swarmsim.site import Site, crossed
 from swarmsim.vehicles.state import RigidState
 
@@ -37,6 +37,7 @@ class Reading:
     travel_m: jax.Array  # [U, 3] way of the crystal during the exposure, world
     axis: jax.Array  # [U, 3] unit vector along the crystal, mean, world
     counts: jax.Array  # [U]
+    rois: jax.Array  # [U, R] the same counts by region of interest (`Spectrometer.rois_kev`)
     exposure_s: jax.Array  # [U] that the counts stand for
     valid: jax.Array  # [U] bool: the vehicle had a part in the mission throughout
     fresh: jax.Array  # [U] bool: completed in this control period
@@ -51,7 +52,7 @@ class Reading:
 class CounterState:
     """Sums of the exposure under way, and the last reading."""
 
-    rate_cps: jax.Array  # [U] sum over evaluations of the observed rate
+    rate_cps: jax.Array  # [U, R] sum over evaluations of the observed rate in each region of interest
     position_m: jax.Array  # [U, 3] sum
     velocity_m_s: jax.Array  # [U, 3] sum
     axis: jax.Array  # [U, 3] sum
@@ -60,8 +61,8 @@ class CounterState:
     reading: Reading
 
 
-def counter_start(vehicles: int) -> CounterState:
-    """State of counters that have measured nothing yet."""
+def counter_start(vehicles: int, rois: int) -> CounterState:
+    """State of counters with so many regions of interest that have measured nothing yet."""
     zero, vectors, no = jnp.zeros(vehicles), jnp.zeros((vehicles, 3)), jnp.zeros(vehicles, bool)
     reading = Reading(
         time_s=zero,
@@ -69,13 +70,14 @@ def counter_start(vehicles: int) -> CounterState:
         travel_m=vectors,
         axis=vectors,
         counts=zero,
+        rois=jnp.zeros((vehicles, rois)),
         exposure_s=zero,
         valid=no,
         fresh=no,
     )
     none = jnp.zeros(vehicles, jnp.int32)
     return CounterState(
-        rate_cps=zero,
+        rate_cps=jnp.zeros((vehicles, rois)),
         position_m=vectors,
         velocity_m_s=vectors,
         axis=vectors,
@@ -86,13 +88,13 @@ def counter_start(vehicles: int) -> CounterState:
 
 
 def source_rate(site: Site, detector: Detector, sources: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
-    """Net count rate [] that all sources (leading axis S) cause in a crystal at a place [3] with an axis [3]."""
+    """Net count rates [R] that all sources (leading axis S) cause in a crystal at a place [3] with an axis [3]."""
 
     def one(source: Source) -> jax.Array:
         way = crossed(site, source.position_m, position_m)
-        return net_rate(detector, source, way, position_m, axis)
+        return roi_rates(detector, source, way, position_m, axis)
 
-    return jnp.sum(jax.vmap(one)(sources))
+    return jnp.sum(jax.vmap(one)(sources), axis=0)
 
 
 def unread(state: CounterState) -> CounterState:
@@ -142,9 +144,9 @@ def count(
         return _drawn(counter, rate_cps, member, key, tick, control_period_s)
 
     def evaluate() -> tuple[jax.Array, jax.Array]:
-        """Observed rate [U], and counts [U] if the exposure ends now."""
+        """Observed rates [U, R], and counts [U, R] if the exposure ends now."""
         rate = jax.vmap(lambda place, along: source_rate(site, counter.detector, sources, place, along))(centre, axis)
-        rate = observed_rate(counter.detector, rate)
+        rate = observed_rois(counter.detector, rate)
         total = state.rate_cps + rate
         counts = draw(total) if counter.evaluations == 1 else jax.lax.cond(ends, draw, lambda _: none, total)
         return rate, counts
@@ -168,7 +170,7 @@ def count(
 def _drawn(
     counter: Counter, rate_cps: jax.Array, member: jax.Array, key: jax.Array, tick: jax.Array, control_period_s: float
 ) -> jax.Array:
-    """Counts [U] of an exposure with the sum ``rate_cps`` [U] over its evaluations."""
+    """Counts [U, R] of an exposure with the sum ``rate_cps`` [U, R] over its evaluations."""
     live_s = jnp.float32(counter.ticks * counter.evaluations * control_period_s)
     keys = randomness.per_vehicle(randomness.consumer(key, "counts"), tick, member)
     mean = jax.lax.stop_gradient(rate_cps / counter.evaluations)
@@ -189,9 +191,11 @@ def _read_out(
         position_m=state.position_m / n,
         travel_m=state.velocity_m_s / n * live_s,
         axis=state.axis / norm,
-        counts=counts,
+        counts=jnp.sum(counts, axis=-1),
+        rois=counts,
         exposure_s=exposure,
         valid=state.used == n,
         fresh=jnp.ones(vehicles, bool),
     )
-    return replace(counter_start(vehicles), expected_counts=mean * exposure, reading=reading)
+    expected = jnp.sum(mean, axis=-1) * exposure
+    return replace(counter_start(vehicles, counts.shape[-1]), expected_counts=expected, reading=reading)

@@ -57,7 +57,8 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array) -> Crossed
     share, moment = _box_fractions(site.obstacles, a, direction)
     stacked = jnp.stack([share, jax.lax.stop_gradient(moment)])
     fractions, moments = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
-    soil, soil_place = share_below(site, above, a, b)
+    # A function with its own derivative takes no arrays of the host, as the values of a world are: add nothing to them.
+    soil, soil_place = share_below(site, above, jnp.add(a, 0.0), jnp.add(b, 0.0))
     ground = materials == site.ground_material
     fractions = fractions + jnp.where(ground, soil, 0.0)
     moments = moments + jnp.where(ground, jax.lax.stop_gradient(soil * soil_place), 0.0)

@@ -70,7 +70,7 @@ def _group_start(world: World, group: Group, key: jax.Array, active: bool) -> Gr
         impact_m_s=jnp.zeros(size),
         finite=jnp.ones(size, bool),
         event_time_s=jnp.broadcast_to(events.none_yet(), (size, len(events.KINDS))),
-        counter=None if group.counter is None else counter_start(size),
+        counter=None if group.counter is None else counter_start(size, group.counter.detector.background_rois.shape[0]),
     )
 
 

@@ -26,6 +26,7 @@ from tests.config.project import line_of, make_project, spoil
 ALTITUDE = "phases.survey.settings.altitude_m=30"
 COMMANDS = ("run", "view", "check", "schema", "list", "init", "import-site")
 SUMMARY: dict[str, Any] = {
+    "status": "located",
     "finding": "Co-60 of 171 MBq at (12.1, 4.0)",
     "warnings": ["a collision may have gone unnoticed"],
     "phases": {

@@ -13,6 +13,7 @@ from swarmsim.estimation.windows import gather, measured, windows_start
 
 FRAMES, VEHICLES, PER_WINDOW = 60, 3, 7
 add = jax.jit(gather, static_argnames="per_window")
+ROIS = 3  # regions of interest
 
 
 def samples(seed=0, frames=FRAMES):
@@ -21,12 +22,14 @@ def samples(seed=0, frames=FRAMES):
     axis = rng.normal(size=(frames, VEHICLES, 3)) * 0.2 + [0.0, 1.0, 0.0]
     time = np.broadcast_to(0.09 * np.arange(1, frames + 1)[:, None], (frames, VEHICLES))
     shape = (frames, VEHICLES)
+    rois = rng.poisson(3.0, (*shape, ROIS))
     taken = Measurements(
         time_s=jnp.asarray(time, jnp.float32),
         position_m=jnp.asarray(rng.uniform(-300.0, 300.0, (*shape, 3)), jnp.float32),
         travel_m=jnp.asarray(rng.normal(size=(*shape, 3)), jnp.float32),
         axis=jnp.asarray(axis / np.linalg.norm(axis, axis=-1, keepdims=True), jnp.float32),
-        counts=jnp.asarray(rng.poisson(9.0, shape), jnp.float32),
+        counts=jnp.asarray(rois.sum(axis=-1), jnp.float32),
+        rois=jnp.asarray(rois, jnp.float32),
         exposure_s=jnp.asarray(rng.uniform(0.05, 0.15, shape), jnp.float32),
         valid=jnp.ones(shape, bool),
         detector=jnp.full(shape, 2, jnp.int32),
@@ -42,7 +45,7 @@ def of_vehicle(taken, new, vehicle):
 
 def assert_equal(found, expected):
     """All but places, whose mean over a window is taken of large numbers here and of differences there."""
-    for name in ("time_s", "travel_m", "axis", "counts", "exposure_s", "valid", "detector"):
+    for name in ("time_s", "travel_m", "axis", "counts", "rois", "exposure_s", "valid", "detector"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=2e-5, atol=1e-5, err_msg=name)
     np.testing.assert_allclose(found.position_m, expected.position_m, atol=3e-4)
 
@@ -50,7 +53,7 @@ def assert_equal(found, expected):
 @pytest.mark.parametrize("portions", [[FRAMES], [1] * FRAMES, [0, 13, 40, 7]])
 def test_windows_equal_the_sums_of_all_samples_in_any_portions(portions):
     taken, new = samples()
-    windows = windows_start(VEHICLES, 12)
+    windows = windows_start(VEHICLES, 12, ROIS)
     begin = 0
     for count in portions:
         part = slice(begin, begin + count)
@@ -71,7 +74,7 @@ def test_windows_equal_the_sums_of_all_samples_in_any_portions(portions):
 def test_samples_beyond_the_last_window_are_dropped():
     taken, _ = samples(1)
     every = jnp.ones((FRAMES, VEHICLES), bool)
-    windows = add(windows_start(VEHICLES, 3), taken, every, per_window=PER_WINDOW)
+    windows = add(windows_start(VEHICLES, 3, ROIS), taken, every, per_window=PER_WINDOW)
     first = jax.tree.map(lambda x: x[: 3 * PER_WINDOW], taken)
     np.testing.assert_allclose(windows.counts.sum(axis=1), first.counts.sum(axis=0))
     np.testing.assert_allclose(windows.exposure_s.sum(axis=1), first.exposure_s.sum(axis=0), rtol=1e-5)
@@ -88,7 +91,7 @@ def test_contents_of_samples_that_are_not_new_never_matter():
         ),
         taken,
     )
-    start = windows_start(VEHICLES, 12)
+    start = windows_start(VEHICLES, 12, ROIS)
     jax.tree.map(
         np.testing.assert_array_equal,
         add(start, spoilt, new, per_window=PER_WINDOW),
@@ -97,7 +100,7 @@ def test_contents_of_samples_that_are_not_new_never_matter():
 
 
 def test_nothing_measured_has_no_valid_window():
-    none = measured(windows_start(2, 4), 1)
+    none = measured(windows_start(2, 4, ROIS), 1)
     assert none.counts.shape == (8,)
     assert not np.any(none.valid)
     assert np.isfinite(none.position_m).all()
@@ -108,7 +111,7 @@ def test_nothing_measured_has_no_valid_window():
 def test_missions_of_a_batch_have_their_own_windows():
     batch = [samples(seed) for seed in range(3)]
     taken, new = jax.tree.map(lambda *x: jnp.stack(x), *batch)
-    start = windows_start(VEHICLES, 12)
+    start = windows_start(VEHICLES, 12, ROIS)
     together = jax.vmap(partial(gather, per_window=PER_WINDOW), in_axes=(None, 0, 0))(start, taken, new)
     for number, (one, fresh) in enumerate(batch):
         alone = add(start, one, fresh, per_window=PER_WINDOW)

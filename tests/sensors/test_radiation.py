@@ -10,7 +10,7 @@ import pytest
 
 from swarmsim.config.errors import InputError
 from swarmsim.physics.rotations import from_yaw
-from swarmsim.radiation.rate import observed_rate
+from swarmsim.radiation.rate import observed_rois
 from swarmsim.sensors.radiation import Counter, count, counter_start, source_rate, unread
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world.build import detector_models
@@ -66,7 +66,9 @@ def sampled(field, way, active, key):
         )  # fmt: skip
         return state, (state.reading, state.expected_counts)
 
-    return jax.lax.scan(tick, counter_start(2), (jnp.arange(1, TICKS + 1), way, active))[1]
+    return jax.lax.scan(
+        tick, counter_start(2, group.counter.detector.background_rois.shape[0]), (jnp.arange(1, TICKS + 1), way, active)
+    )[1]
 
 
 @jax.jit
@@ -77,7 +79,8 @@ def rates(field, way):
     place = way.position_m + rotate(way.quaternion, counter.mount_position_m)
     axis = rotate(way.quaternion, counter.mount_axis)
     one = partial(source_rate, field.site, counter.detector, field.sources)
-    return observed_rate(counter.detector, jax.vmap(jax.vmap(one))(place, axis)), place, axis
+    rates = observed_rois(counter.detector, jax.vmap(jax.vmap(one))(place, axis))
+    return jnp.sum(rates, axis=-1), place, axis
 
 
 def _rotated(q, v):
@@ -153,7 +156,9 @@ def test_the_draw_depends_on_the_vehicles_number_and_not_on_its_company(field, w
             )  # fmt: skip
             return state, state.reading
 
-        return jax.lax.scan(tick, counter_start(1), (jnp.arange(1, TICKS + 1), way))[1]
+        return jax.lax.scan(
+            tick, counter_start(1, counter.detector.background_rois.shape[0]), (jnp.arange(1, TICKS + 1), way)
+        )[1]
 
     reading = alone(field, jax.tree.map(lambda x: x[:, 1:], way))
     np.testing.assert_array_equal(np.asarray(reading.counts)[:, 0], read[0].counts[:, 1])
