@@ -74,6 +74,36 @@ class Wind(Model):
     gusts: bool = False
 
 
+class BackgroundPatches(Model):
+    """Smooth random variation of the ground's radiation: relative standard deviation and correlation length."""
+
+    std: float = Field(default=0.0, ge=0, le=1)
+    length_m: float = Field(default=25.0, ge=1, le=10_000)
+
+
+class BackgroundStep(Model):
+    """An edge beyond which the ground radiates more: relative rise, bearing to the higher side, a point on the edge."""
+
+    share: float = Field(default=0.0, ge=-0.9, le=10)
+    toward_deg: float = Field(default=0.0, ge=-360, le=360)
+    through_m: Vec2 = (0.0, 0.0)
+    width_m: float = Field(default=2.0, ge=0.01, le=1000)
+
+
+class BackgroundField(Model):
+    """Natural background over the site, relative to the nominal one of each detector.
+
+    ``surfaces`` are factors of materials that surfaces are made of (1 without one). ``ground_share`` of the nominal
+    background comes from the ground; that part falls with height and varies with surface, ``patches`` and ``step``.
+    """
+
+    scale: float = Field(default=1.0, ge=0, le=1000)
+    ground_share: float = Field(default=0.85, ge=0, le=1)
+    surfaces: dict[Name, Annotated[float, Field(ge=0, le=100)]] = Field(default_factory=dict, max_length=100)
+    patches: BackgroundPatches = BackgroundPatches()
+    step: BackgroundStep = BackgroundStep()
+
+
 class Traffic(Model):
     """Least distances, m, between UAVs in flight, between rovers, and between vehicles' outlines at the start."""
 
@@ -212,6 +242,7 @@ class Mission(Model):
     sources: tuple[Source, ...] = Field(max_length=16)
     vehicles: tuple[TeamMember, ...] = Field(min_length=1, max_length=TEAM_MAX)
     wind: Wind = Wind()
+    background: BackgroundField = BackgroundField()
     effects: FlightEffects = FlightEffects()
     failsafes: Failsafes = Failsafes()
     traffic: Traffic = Traffic()

@@ -123,9 +123,13 @@ class BackgroundLine(Model):
 
 
 class Background(Model):
-    """Natural background: counts per second, and its spectrum (lines on a continuum exp(-E / continuum_kev))."""
+    """Natural background: counts per second at ``height_m`` above ground, and its spectrum.
+
+    The spectrum are lines on a continuum exp(-E / continuum_kev).
+    """
 
     rate_cps: float = Field(ge=0, le=1e7)
+    height_m: float = Field(default=0.0, ge=0, le=1000)
     continuum_kev: PhotonEnergy
     lines: tuple[BackgroundLine, ...] = Field(default=(), max_length=64)
 

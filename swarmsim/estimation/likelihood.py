@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector, Source, net_rate, observed_rate
+from swarmsim.radiation.background import fall_with_height
 from swarmsim.site import Site, sample, sample_with_gradient
 from swarmsim.site.rays import BLOCK, crossed_from
 
@@ -31,6 +32,7 @@ class FitProblem:
     detectors: tuple[Detector, ...]
     measurements: Measurements
     nuclide: jax.Array  # [] int32 index in the library's order
+    natural: jax.Array  # [n] background over the detector's nominal one, where the ground is even
     extra_cps: jax.Array  # [n] net rate of other, known sources
     height_m: jax.Array  # [] prior mean of the height above ground
     height_std_m: jax.Array  # [] prior standard deviation
@@ -158,10 +160,20 @@ def poisson_log_likelihood(counts: jax.Array, mean: jax.Array, valid: jax.Array)
     return jnp.sum(jnp.where(valid, jnp.where(counts > 0.0, seen, -mean), 0.0))
 
 
+def natural_background(
+    site: Site, detectors: tuple[Detector, ...], m: Measurements, ground_share: jax.Array | float
+) -> jax.Array:
+    """Background [n] over each detector's nominal one by its height above an even ground."""
+    height = m.position_m[:, 2] - sample(site.terrain_m, site, m.position_m[:, :2])
+    reference = jnp.stack([d.background_height_m for d in detectors])[m.detector]
+    return jnp.where(m.valid, fall_with_height(jnp.asarray(ground_share), height, reference), 1.0)
+
+
 def expected_counts(problem: FitProblem, net_cps: jax.Array, log_scale: jax.Array) -> jax.Array:
     """Mean counts [n] for net rates [n] of the source sought; the known extra rate is added."""
     m = problem.measurements
-    return m.exposure_s * observed_rates(problem.detectors, m, net_cps + problem.extra_cps, jnp.exp(log_scale))
+    scale = jnp.exp(log_scale) * problem.natural
+    return m.exposure_s * observed_rates(problem.detectors, m, net_cps + problem.extra_cps, scale)
 
 
 def evaluate(problem: FitProblem, theta: jax.Array) -> Evaluation:
@@ -216,6 +228,7 @@ def fisher_information(
     background_scale: jax.Array | float = 1.0,
     extra_rate_cps: jax.Array | float = 0.0,
     rays: int = 1,
+    ground_share: jax.Array | float = 0.0,
 ) -> jax.Array:
     """Fisher information [5, 5] that samples hold about a source; only where and how long they were taken matters.
 
@@ -229,6 +242,7 @@ def fisher_information(
         background_scale: [] true background over the nominal one.
         extra_rate_cps: [] or [n] net rate of other sources.
         rays: to each measurement, along its way (static).
+        ground_share: [] share of the nominal background that falls with height.
 
     Returns:
         Information about (x m, y m, height above ground m, log activity, log background scale), without any prior.
@@ -242,6 +256,7 @@ def fisher_information(
         detectors=detectors,
         measurements=cleared(measurements),
         nuclide=nuclide,
+        natural=natural_background(site, detectors, cleared(measurements), ground_share),
         extra_cps=jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), measurements.counts.shape),
         height_m=height,
         height_std_m=jnp.asarray(jnp.inf, jnp.float32),

@@ -15,6 +15,7 @@ from swarmsim.estimation.likelihood import (
     FitProblem,
     evaluate,
     in_blocks,
+    natural_background,
     position_covariance,
     position_of,
     scaled_inverse,
@@ -44,6 +45,7 @@ class LocalisationParams:
     presumed_height_m: jax.Array  # [] prior mean of the source's height above ground
     height_std_m: jax.Array  # [] its standard deviation; 0 = known
     learning_rate_m: jax.Array  # [] first step of Adam
+    ground_share: jax.Array  # [] share of the nominal background that falls with height
     search_radius_m: jax.Array  # [] reach of the first round of the pattern search
     iterations: int = static()  # of Adam
     search_rounds: int = static()  # of the pattern search
@@ -71,12 +73,13 @@ class SourceFit:
     converged: jax.Array  # [] bool: those are enough for a mean, and the place is within the site
 
 
-def localisation_params(spec: Localisation) -> LocalisationParams:
-    """Settings from the configuration (host)."""
+def localisation_params(spec: Localisation, ground_share: float = 0.0) -> LocalisationParams:
+    """Settings from the configuration (host); ``ground_share`` of the background falls with height."""
     return LocalisationParams(
         presumed_height_m=jnp.float32(spec.presumed_height_m),
         height_std_m=jnp.float32(spec.height_std_m),
         learning_rate_m=jnp.float32(spec.learning_rate_m),
+        ground_share=jnp.float32(ground_share),
         search_radius_m=jnp.float32(spec.search_radius_m),
         iterations=spec.iterations,
         search_rounds=spec.search_rounds,
@@ -119,6 +122,7 @@ def localise(
         detectors=detectors,
         measurements=m,
         nuclide=nuclide,
+        natural=natural_background(site, detectors, m, params.ground_share),
         extra_cps=jnp.where(m.valid, extra, 0.0),
         height_m=params.presumed_height_m,
         height_std_m=params.height_std_m,

@@ -19,6 +19,7 @@ from swarmsim.estimation.windows import Windows, measured
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey
 from swarmsim.pytree import pytree
+from swarmsim.radiation.background import BackgroundField, background_factor
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.poisson import poisson
@@ -98,11 +99,17 @@ def _spectrum(key: jax.Array, world: World, plan: Plan, known: Survey, measureme
     near = jnp.sqrt(jnp.sum(apart * apart, axis=-1)) < plan.spectrum_radius_m
     used = near & measurements.valid & (measurements.detector == plan.spectrometer)
     counter = next(g.counter for g in world.groups if g.counter is not None and g.counter.index == plan.spectrometer)
-    return accumulate_spectrum(key, world.site, counter.detector, world.sources, measurements, used)
+    return accumulate_spectrum(key, world.site, counter.detector, world.sources, world.background, measurements, used)
 
 
 def accumulate_spectrum(
-    key: jax.Array, site: Site, detector: Detector, sources: Source, samples: Measurements, used: jax.Array
+    key: jax.Array,
+    site: Site,
+    detector: Detector,
+    sources: Source,
+    background: BackgroundField,
+    samples: Measurements,
+    used: jax.Array,
 ) -> Accumulated:
     """The spectrum taken during the samples that are ``used`` [n].
 
@@ -117,7 +124,8 @@ def accumulate_spectrum(
         def of_source(source: Source) -> jax.Array:
             return spectrum_rate(detector, source, crossed(site, source.position_m, position), position, axis)
 
-        return jnp.sum(jax.vmap(of_source)(sources), axis=0) + detector.background_spectrum
+        natural = background_factor(background, site, key, position, detector.background_height_m)
+        return jnp.sum(jax.vmap(of_source)(sources), axis=0) + natural * detector.background_spectrum
 
     def add(total: jax.Array, sample: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         position, axis, live = sample

@@ -48,7 +48,9 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
         site=site_model.site,
         detectors=detectors,
         mapping=mapping,
-        localisation=None if localisation is None or not detectors else localisation_params(localisation),
+        localisation=None
+        if localisation is None or not detectors
+        else localisation_params(localisation, scenario.mission.background.ground_share),
         presumed_nuclide=on_host(nuclide, np.int32),
         spectrum_radius_m=on_host(0.0 if identification is None else identification.spectrum_radius_m),
         confidence_min=on_host(1.0 if identification is None else identification.confidence_min),

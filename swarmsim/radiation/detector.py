@@ -46,7 +46,8 @@ class Detector:
     length_m: jax.Array  # []
     mount_position_m: jax.Array  # [3] crystal centre, body FLU
     mount_axis: jax.Array  # [3] unit, crystal axis, body FLU
-    background_cps: jax.Array  # []
+    background_cps: jax.Array  # [] nominal
+    background_height_m: jax.Array  # [] above ground, where it is that
     paralyzable_s: jax.Array  # []
     non_paralyzable_s: jax.Array  # []
     sample_period_s: jax.Array  # [] live time of one measurement
@@ -109,6 +110,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         mount_position_m=f32(mount.position_m),
         mount_axis=f32(axis),
         background_cps=f32(spec.background.rate_cps),
+        background_height_m=f32(spec.background.height_m),
         paralyzable_s=f32(spec.dead_time.paralyzable_us * 1e-6),
         non_paralyzable_s=f32(spec.dead_time.non_paralyzable_us * 1e-6),
         sample_period_s=f32(spec.sample_period_s),

@@ -59,6 +59,7 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
         mount_position_m=f32(np.zeros(3)),
         mount_axis=f32([0.0, 0.0, 1.0]),
         background_cps=zero,
+        background_height_m=zero,
         paralyzable_s=zero,
         non_paralyzable_s=zero,
         sample_period_s=f32(1.0),

@@ -138,9 +138,12 @@ def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.
     return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares)
 
 
-def observed_rois(detector: Detector, net_cps: jax.Array) -> jax.Array:
-    """Counts per second [..., R] after dead time of net rates [..., R], background included (`observed_rate`)."""
-    true = net_cps + detector.background_rois
+def observed_rois(detector: Detector, net_cps: jax.Array, background: jax.Array | float = 1.0) -> jax.Array:
+    """Counts per second [..., R] after dead time of net rates [..., R], with the background (`observed_rate`).
+
+    ``background`` [...] is the background over the detector's nominal one.
+    """
+    true = net_cps + jnp.asarray(background)[..., None] * detector.background_rois
     total = jnp.sum(true, axis=-1)
     shown = observed_rate(detector, total - detector.background_cps)
     return true * (shown / jnp.maximum(total, 1e-30))[..., None]

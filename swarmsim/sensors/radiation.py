@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from swarmsim import randomness
 from swarmsim.physics.rotations import rotate
 from swarmsim.pytree import pytree, static
+from swarmsim.radiation.background import BackgroundField, background_factor
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import draw_counts, exposure_of, observed_rois, roi_rates
 from swarmsim.site import Site, crossed
@@ -110,6 +111,7 @@ def count(
     member: jax.Array,
     site: Site,
     sources: Source,
+    background: BackgroundField,
     key: jax.Array,
     tick: jax.Array,
     control_period_s: float,
@@ -126,7 +128,7 @@ def count(
         body: poses and velocities [U] then.
         active: [U] bool, vehicles that have a part in the mission.
         member: [U] int32, number of each vehicle in the mission.
-        site, sources: the true world.
+        site, sources, background: the true world.
         key: of the mission; a draw depends on it, the time and the vehicle's number only.
         tick, control_period_s: the time; the first control period has the number 1.
         due: [] bool; without it the state is returned as it is.
@@ -146,7 +148,10 @@ def count(
     def evaluate() -> tuple[jax.Array, jax.Array]:
         """Observed rates [U, R], and counts [U, R] if the exposure ends now."""
         rate = jax.vmap(lambda place, along: source_rate(site, counter.detector, sources, place, along))(centre, axis)
-        rate = observed_rois(counter.detector, rate)
+        own = jax.random.wrap_key_data(bits, impl=impl)
+        reference = counter.detector.background_height_m
+        natural = jax.vmap(lambda place: background_factor(background, site, own, place, reference))(centre)
+        rate = observed_rois(counter.detector, rate, natural)
         total = state.rate_cps + rate
         counts = draw(total) if counter.evaluations == 1 else jax.lax.cond(ends, draw, lambda _: none, total)
         return rate, counts

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import gaussian_filter
 
 from swarmsim.config.checks import footprint_radius_m
 from swarmsim.config.errors import InputError
@@ -16,6 +17,7 @@ from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.physics.multirotor import check_time_step
 from swarmsim.pytree import on_host
+from swarmsim.radiation.background import SMOOTH_M, BackgroundField
 from swarmsim.radiation.detector import Detector, Source, build_detector
 from swarmsim.radiation.library import Library
 from swarmsim.sensors.radiation import Counter
@@ -81,6 +83,7 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
             from_rad=_f32(math.radians(mission.wind.from_deg)),
             gusts=_f32(mission.wind.gusts),
         ),
+        background=_background(scenario, site),
         traffic=TrafficRules(
             separation_m=_f32(mission.traffic.separation_m),
             ground_separation_m=_f32(mission.traffic.ground_separation_m),
@@ -96,6 +99,46 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
         timing=timing,
         engine=mission.engine,
     )
+
+
+def _background(scenario: Scenario, site: Site) -> BackgroundField:
+    spec = scenario.mission.background
+    surface = around = np.ones((2, 2))
+    if spec.surfaces:
+        surface = surface_factors(site, dict(spec.surfaces))
+        around = gaussian_filter(surface, SMOOTH_M / float(site.cell_m), mode="nearest")
+    bearing = math.radians(spec.step.toward_deg)
+    normal = np.array([math.sin(bearing), math.cos(bearing)])
+    return BackgroundField(
+        scale=_f32(spec.scale),
+        ground_share=_f32(spec.ground_share),
+        patch_std=_f32(spec.patches.std),
+        patch_length_m=_f32(spec.patches.length_m),
+        step_share=_f32(spec.step.share),
+        step_normal=_f32(normal),
+        step_offset_m=_f32(float(normal @ np.array(spec.step.through_m))),
+        step_width_m=_f32(spec.step.width_m),
+        surface=_f32(surface),
+        around=_f32(around),
+    )
+
+
+def surface_factors(site: Site, factors: dict[str, float]) -> np.ndarray:
+    """Factor [ny, nx] of the uppermost surface in each cell: that of the ground, or of the highest box there."""
+    ny, nx = np.shape(site.terrain_m)
+    names, boxes = site.material_names, site.obstacles
+    x = float(site.origin_m[0]) + float(site.cell_m) * np.arange(nx)
+    y = float(site.origin_m[1]) + float(site.cell_m) * np.arange(ny)
+    found = np.full((ny, nx), factors.get(names[int(site.ground_material)], 1.0))
+    top = np.full((ny, nx), -np.inf)
+    columns = (np.asarray(a, float) for a in (boxes.centre_m, boxes.half_extent_m, boxes.axis))
+    for centre, half, (c, s), material in zip(*columns, np.asarray(boxes.material), strict=True):
+        offset_x, offset_y = x[None, :] - centre[0], y[:, None] - centre[1]
+        inside = (np.abs(c * offset_x + s * offset_y) <= half[0]) & (np.abs(c * offset_y - s * offset_x) <= half[1])
+        higher = inside & (centre[2] + half[2] > top)
+        found[higher] = factors.get(names[int(material)], 1.0)
+        top[higher] = centre[2] + half[2]
+    return found
 
 
 def _failsafes(scenario: Scenario, site: Site) -> FailsafeRules:

@@ -57,7 +57,7 @@ def counted(
         tick = (first // counter.ticks + 1 + place) * counter.ticks
         due = running & (tick <= first + ticks)
         counter_state = count(
-            counter, counter_state, body, measuring, group.member, world.site, world.sources, key, tick,
-            world.timing.control_period_s, due, branch,
+            counter, counter_state, body, measuring, group.member, world.site, world.sources, world.background,
+            key, tick, world.timing.control_period_s, due, branch,
         )  # fmt: skip
     return replace(after, counter=counter_state)

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from swarmsim.pytree import pytree, static
+from swarmsim.radiation.background import BackgroundField
 from swarmsim.radiation.detector import Source
 from swarmsim.scalars import Layout
 from swarmsim.sensors.radiation import Counter
@@ -108,6 +109,7 @@ class World:
     walls: Walls  # of the site, for what flies
     sources: Source  # leading axis S >= 1; a source of no activity stands in for none
     air: Air
+    background: BackgroundField
     traffic: TrafficRules
     failsafes: FailsafeRules
     radio: Radio

@@ -87,6 +87,7 @@ def test_score_has_zero_mean_and_the_information_as_covariance():
             detectors=d,
             measurements=draw(m, rates, key),
             nuclide=NUCLIDE,
+            natural=jnp.ones(231),
             extra_cps=jnp.zeros(231),
             height_m=jnp.float32(1.0),
             height_std_m=jnp.float32(jnp.inf),

@@ -23,7 +23,7 @@ def problem_of(boxes, seed):
     m = draw(flight, mean_rates(site, d, flight, [(SOURCE, ACTIVITY)]), seed)
     m = jax.tree.map(lambda leaf: leaf[jnp.argsort(m.position_m[:, 2])], m)
     return FitProblem(
-        site=site, detectors=d, measurements=m, nuclide=NUCLIDE, extra_cps=jnp.zeros(231),
+        site=site, detectors=d, measurements=m, nuclide=NUCLIDE, natural=jnp.ones(231), extra_cps=jnp.zeros(231),
         height_m=jnp.float32(1.0), height_std_m=jnp.float32(1e-3), rays=1,
     )  # fmt: skip
 

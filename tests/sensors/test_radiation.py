@@ -31,7 +31,8 @@ def field():
     (group,) = made.groups
     counter = replace(group.counter, mount_position_m=MOUNTS, mount_axis=AXES)
     assert (counter.ticks, counter.evaluations) == (EVERY, EXPOSURE // EVERY)
-    return replace(made, groups=(replace(group, counter=counter),))
+    even = replace(made.background, ground_share=jnp.float32(0.0))
+    return replace(made, background=even, groups=(replace(group, counter=counter),))
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +62,8 @@ def sampled(field, way, active, key):
     def tick(state, x):
         number, body, active = x
         state = count(
-            group.counter, unread(state), body, active, member, field.site, field.sources, key, number,
-            jnp.float32(TICK_S), number % EVERY == 0,
+            group.counter, unread(state), body, active, member, field.site, field.sources, field.background,
+            key, number, jnp.float32(TICK_S), number % EVERY == 0,
         )  # fmt: skip
         return state, (state.reading, state.expected_counts)
 
@@ -152,7 +153,7 @@ def test_the_draw_depends_on_the_vehicles_number_and_not_on_its_company(field, w
         def tick(state, x):
             state = count(
                 counter, unread(state), x[1], jnp.ones(1, bool), jnp.array([7]), field.site, field.sources,
-                jax.random.key(0), x[0], jnp.float32(TICK_S), x[0] % EVERY == 0,
+                field.background, jax.random.key(0), x[0], jnp.float32(TICK_S), x[0] % EVERY == 0,
             )  # fmt: skip
             return state, state.reading
 
@@ -198,6 +199,7 @@ def test_a_detector_faster_than_the_judging_is_refused():
 def test_each_group_counts_with_its_own_detector():
     made = team()
     silent = replace(made, sources=replace(made.sources, activity_bq=jnp.zeros_like(made.sources.activity_bq)))
+    silent = replace(silent, background=replace(silent.background, ground_share=jnp.float32(0.0)))
     state = begin(silent, jax.random.key(2))
     after, _ = fly(silent, state, stay(silent, state), 1.0)
     uavs, rovers = (group.counter for group in after.groups)
