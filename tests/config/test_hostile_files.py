@@ -21,8 +21,8 @@ FILES = {
     "fifty megabytes": ("#" * 50_000_000, "too large for a configuration file"),
     "a megabyte of comment": ("#" * 999_000, "is empty"),
     "a megabyte of text": ('x: "' + "a b\\n" * 190_000 + '"', "this field is missing"),
-    "many fields": ("".join(f"k{i}: {i}\n" for i in range(19_000)), "there are more problems"),
-    "a name many times": ("name: x\n" * 19_000, "given twice"),
+    "many fields": ("".join(f"k{i}: {i}\n" for i in range(14_000)), "there are more problems"),
+    "a name many times": ("name: x\n" * 14_000, "given twice"),
     "a long name of a field": ("x" * 100_000 + "y: 1", "is not valid YAML"),
     "a field's name of 300 letters": ("x" * 300 + ": 1", "at most 200 characters"),
     "many phases": (
