@@ -257,7 +257,25 @@ def _counter(scenario: Scenario, specs: Sequence[Spec], timing: Timing, library:
 
 def _detector(scenario: Scenario, model: str, library: Library) -> Detector:
     mount = next(s.detector for s in scenario.vehicles if s.detector is not None and s.detector.model == model)
-    return build_detector(scenario.detectors[model], mount, library, scenario.mission.detection)
+    return _detector_of(scenario.detectors[model], mount, library, scenario.mission.detection)
+
+
+_DETECTORS_KEPT = 8
+_detectors: list[tuple[tuple[Any, ...], Detector]] = []
+
+
+def _detector_of(*of: Any) -> Detector:
+    """`build_detector`, whose tables take a second, with its last results kept: missions of a family share theirs.
+
+    The arguments are compared, not hashed: their models hold mappings.
+    """
+    for known, detector in _detectors:
+        if known == of:
+            return detector
+    detector = build_detector(*of)
+    _detectors.append((of, detector))
+    del _detectors[:-_DETECTORS_KEPT]
+    return detector
 
 
 def _exposure_ticks(scenario: Scenario, model: str, timing: Timing) -> int:
