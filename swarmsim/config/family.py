@@ -110,7 +110,17 @@ def read_family(document: Document, near: Path | None) -> tuple[tuple[Varied, ..
         except InputError as error:
             problems += error.problems
     problems += _overlaps(document, found)
-    return tuple(found[place] for place in sorted(found, key=dotted)), problems
+    in_order = sorted(found, key=lambda place: [(isinstance(step, str), step) for step in place])
+    return tuple(found[place] for place in in_order), problems
+
+
+def canonical(document: Document, path: str, near: Path | None) -> str:
+    """A path with the indices of what it names, as draws are listed by; as it is where there is no such thing."""
+    try:
+        (place,) = _places(document, path, near)
+    except (InputError, ValueError):
+        return path
+    return dotted(place)
 
 
 def _tuples(value: Any) -> Any:

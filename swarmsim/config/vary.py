@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from swarmsim.config.base import Fraction, Gap, Length, Model
+from swarmsim.config.base import Gap, Length, Model, NonNegative
 
 SOURCES_MAX = 16
 VARIED_MAX = 200  # paths
@@ -55,7 +55,7 @@ class PlaceIn(Model):
     """
 
     region: Region | Annotated[tuple[Region, ...], Field(min_length=1, max_length=len(REGIONS))]
-    weights: Annotated[tuple[Fraction, ...], Field(max_length=len(REGIONS))] | None = None
+    weights: Annotated[tuple[NonNegative, ...], Field(max_length=len(REGIONS))] | None = None
     margin_m: Gap = 0.5
     near_m: Length = 3.0
     apart_m: Gap = 0.0
@@ -89,7 +89,7 @@ class Distribution(Model):
     log_uniform: tuple[Number, Number] | None = None
     normal: Normal | None = None
     choice: Annotated[tuple[Any, ...], Field(min_length=1, max_length=CHOICES_MAX)] | None = None
-    weights: Annotated[tuple[Fraction, ...], Field(max_length=CHOICES_MAX)] | None = None
+    weights: Annotated[tuple[NonNegative, ...], Field(max_length=CHOICES_MAX)] | None = None
     count: tuple[Annotated[int, Field(ge=0, le=SOURCES_MAX)], Annotated[int, Field(ge=1, le=SOURCES_MAX)]] | None = None
     place: PlaceIn | None = None
     any_nuclide: AnyNuclide | None = None

@@ -1,5 +1,6 @@
 """What one flown mission leaves behind, as numpy arrays on the host: the input of all that is written or shown."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -161,6 +162,7 @@ class MissionRecord:
     events: tuple[Event, ...]
     finding: str  # one sentence: what the mission found
     warnings: tuple[str, ...] = ()  # what makes parts of the result doubtful
+    drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
 
     def phase(self, name: str) -> Phase | None:
         """The phase of a name; None where it did not begin."""
