@@ -35,22 +35,28 @@ def check_files(paths: Sequence[Path]) -> None:
             continue
         for file in found:
             try:
-                kind = check_file(file)
+                what = check_file(file)
             except InputError as error:
                 problems += [problem for problem in error.problems if problem not in problems]
             else:
-                sys.stdout.write(f"ok  {shown_path(file)} ({kind.removesuffix('s')})\n")
+                sys.stdout.write(f"ok  {shown_path(file)} ({what})\n")
     raise_if_any(problems)
 
 
 def check_file(path: Path) -> str:
-    """Validate one file with all that it refers to; its kind. Raises `InputError`."""
+    """Validate one file with all that it refers to; what it is. Raises `InputError`."""
     kind = kind_of_file(path)
     if kind == "missions":
         from swarmsim.config.scenario import load_scenario
         from swarmsim.config.site_checks import check_site
 
-        raise_if_any(check_site(load_scenario(path)))
+        scenario = load_scenario(path)
+        if scenario.family:
+            from swarmsim.runtime.run import build
+
+            build(scenario)
+            return f"mission, a family that varies {', '.join(dict.fromkeys(v.key for v in scenario.family))}"
+        raise_if_any(check_site(scenario))
     elif kind == "sites":
         load_named(kind, path)
         from swarmsim.site import load_site
@@ -58,7 +64,25 @@ def check_file(path: Path) -> str:
         load_site(path, tuple(load_all("materials", path)))
     else:
         load_named(kind, path)
-    return kind
+    return kind.removesuffix("s")
+
+
+def print_draws(name: str, seed: int | None, missions: int, overrides: Sequence[str]) -> None:
+    """Print what missions of a family draw, one column each."""
+    from swarmsim.config.scenario import load_scenario
+    from swarmsim.runtime.run import build
+
+    scenario = load_scenario(name, overrides, seed)
+    if not scenario.family:
+        hint = "add vary to it, e.g. --set 'vary.wind.speed_m_s={uniform: [0, 5]}'"
+        raise InputError.of("is a single mission: nothing is drawn for it", path="vary", given=name, suggestion=hint)
+    first = scenario.mission.seed
+    draws = build(scenario).draw(range(first, first + missions))
+    told = [draws.told(index) for index in range(missions)]
+    table = Table("what", *(f"seed {each}" for each in draws.seeds), title=name, title_justify="left")
+    for path in dict.fromkeys(path for row in told for path in row):
+        table.add_row(path, *(value_text(row[path]) if path in row else "" for row in told))
+    Console(width=None if sys.stdout.isatty() else 40 + 24 * missions).print(table)
 
 
 def kind_of_file(path: Path) -> str:

@@ -53,6 +53,18 @@ class Varied:
         return dotted(self.place)
 
 
+def ends_of(varied: Varied) -> tuple[Any, ...]:
+    """Values that bound what is drawn: the ends of an interval, the least and greatest of numbers, all of others."""
+    drawn = varied.distribution
+    if drawn.interval is not None:
+        low, high = drawn.interval
+        return (int(low), int(high)) if varied.whole else (low, high)
+    values = drawn.choice or ()
+    if values and all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        return min(values), max(values)
+    return values
+
+
 def varied_paths(document: Document) -> list[str]:
     """The paths of ``vary`` as they are written."""
     vary = item(document.data, "vary")

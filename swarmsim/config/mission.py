@@ -200,8 +200,8 @@ class Mission(Model):
 
     Without ``mapping`` there is no radiation map, without ``localisation`` no source is estimated, without
     ``identification`` no nuclide is named. ``vary`` makes a family of it: each mission draws the values at these dotted
-    paths (``wind.speed_m_s``, ``sources.*.activity_mbq``) from its own seed. ``versions`` says what wrote a resolved scenario (package -> version); it
-    changes nothing in the mission.
+    paths (``wind.speed_m_s``, ``sources.*.activity_mbq``) from its own seed. ``versions`` says what wrote a resolved
+    scenario (package -> version); it changes nothing in the mission.
     """
 
     name: Name

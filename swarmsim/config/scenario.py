@@ -134,9 +134,7 @@ def scenario_of(mission: Mission, near: Path | None = None) -> Scenario:
     return resolve(Document(mission.model_dump(mode="json", exclude_none=True)), near, [])
 
 
-def resolve(
-    document: Document, near: Path | None, problems: list[Problem], like: "Scenario | None" = None
-) -> Scenario:
+def resolve(document: Document, near: Path | None, problems: list[Problem], like: "Scenario | None" = None) -> Scenario:
     """The scenario of a mission's document; ``problems`` are those found already. Raises `InputError`.
 
     What is looked up by name (vehicles, detectors, nuclides, materials, the site) is taken from the scenario ``like``

@@ -11,7 +11,7 @@ SOURCES_MAX = 16
 VARIED_MAX = 200  # paths
 CHOICES_MAX = 256
 NORMAL_STDS = 5.0
-"""A normal distribution without bounds is cut off this many standard deviations from its mean (1 draw in 1.7 million)."""
+"""A normal distribution without bounds is cut off this many standard deviations from its mean: 6e-7 of it."""
 
 VariedPath = Annotated[str, Field(min_length=1, max_length=200)]
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
@@ -47,10 +47,10 @@ class Normal(Model):
 class PlaceIn(Model):
     """A place of a source by region of the site; with several regions one is drawn first, by ``weights``.
 
-    All but ``anywhere`` lie in the site's survey area. ``open``: ground with nothing on it or above it, ``margin_m``
+    All but ``anywhere`` lie in the site's survey area. ``open``: ground with nothing on it or above it, ``near_m``
     away from obstacles. ``indoors``: in a hollow box that stands on the ground (a building, a container), ``margin_m``
-    from its walls; every box is as likely, and every place in it. ``behind_walls``: outside, within ``near_m`` of a
-    wall that hides an eighth of the horizon. ``survey_area`` and ``anywhere``: wherever a source can lie, not within a
+    from its walls; every box is as likely, and every place in it. ``behind_walls``: outside, between
+    ``margin_m`` and ``near_m`` from a wall that rises 1 m above the source and hides an eighth of the horizon. ``survey_area`` and ``anywhere``: wherever a source can lie, not within a
     solid thing or a wall. Sources keep ``apart_m`` from each other, horizontally.
     """
 

@@ -69,6 +69,7 @@ class Drawer:
             v.key: _nuclides(scenario, v) for v in scenario.family if v.distribution.any_nuclide is not None
         }
         self._given = self._of_mission()
+        self._check_regions()
 
     def draw(self, seeds: Sequence[int] | np.ndarray) -> Draws:
         """The values of the missions ``seeds``. Raises `InputError` where sources find no place."""
@@ -107,8 +108,13 @@ class Drawer:
             places, regions, crowded = self._places(seed, attempt, placed, sources)
             if crowded is None:
                 return row | places, regions
-        assert crowded is not None
-        raise self._no_room(crowded, seed, float(sources[_source(crowded.place)]["height_m"]))
+            self._check_region(crowded, regions[crowded.path], float(sources[_source(crowded.place)]["height_m"]))
+            apart_m = crowded.distribution.place.apart_m if crowded.distribution.place else 0.0
+        raise InputError([self._scenario.problem(
+            ("vary", crowded.key, "place"),
+            f"'{crowded.path}' of the mission of seed {seed} finds no place {apart_m:g} m from the other sources",
+            suggestion="make apart_m smaller, add a region, or draw fewer sources",
+        )])  # fmt: skip
 
     def _places(
         self, seed: int, attempt: int, placed: Sequence[Varied], sources: Sequence[Row]
@@ -127,9 +133,10 @@ class Drawer:
             height = float(sources[_source(varied.place)]["height_m"])
             away = np.array(taken, float).reshape(-1, 2)
             xy = self._regions.draw(region, place, height, stream.numbers, away)
+            regions[varied.path] = region
             if xy is None:
                 return found, regions, varied
-            found[varied.path], regions[varied.path] = xy.tolist(), region
+            found[varied.path] = xy.tolist()
             taken.append(found[varied.path])
         return found, regions, None
 
@@ -146,31 +153,39 @@ class Drawer:
                 inner[varied.place[-1]] = row[varied.path]
         return sources
 
-    def _no_room(self, varied: Varied, seed: int, height_m: float) -> InputError:
+    def _check_regions(self) -> None:
+        """Raise an `InputError` where a region is empty at the least or the greatest height of a source."""
+        heights = {v.place[1]: v.distribution.interval for v in self._others if v.place[2:] == ("height_m",)}
+        told: set[Any] = set()
+        for varied in self._placed:
+            number, place = _source(varied.place), varied.distribution.place
+            assert place is not None
+            own = self._scenario.mission.sources[number].height_m
+            for height in set(heights.get(number) or (own,)):
+                for region in place.regions:
+                    if (varied.key, region, height) not in told:
+                        told.add((varied.key, region, height))
+                        self._check_region(varied, region, height)
+
+    def _check_region(self, varied: Varied, region: Region, height_m: float) -> None:
+        """Raise an `InputError` where a region has no place, however near other sources are."""
         place = varied.distribution.place
         assert place is not None
         assert self._regions is not None
-        scenario, where = self._scenario, ("vary", varied.key, "place")
-        never = 0x5EED  # any stream will do to see whether a region is empty
-        for region in place.regions:
-            numbers = Stream(never, varied.path).numbers
-            if self._regions.draw(region, place, height_m, numbers, np.zeros((0, 2))) is None:
-                return InputError([scenario.problem(
-                    where,
-                    f"the site '{self._site_name}' has no place in the region '{region}' for a source "
-                    f"{height_m:g} m above the ground",
-                    allowed=_WANTED[region],
-                    suggestion="leave the region out, make margin_m smaller, or vary height_m in other bounds",
-                )])  # fmt: skip
-        return InputError([scenario.problem(
-            where,
-            f"'{varied.path}' of the mission of seed {seed} finds no place {place.apart_m:g} m from the other sources",
-            suggestion="make apart_m smaller, add a region, or draw fewer sources",
+        numbers = Stream(0, f"is there any {region}").numbers  # any will do
+        if self._regions.draw(region, place, height_m, numbers, np.zeros((0, 2))) is not None:
+            return
+        raise InputError([self._scenario.problem(
+            ("vary", varied.key, "place"),
+            f"the site '{self._site_name}' has no place in the region '{region}' for a source {height_m:g} m above "
+            "the ground",
+            allowed=_WANTED[region],
+            suggestion="leave the region out, make margin_m smaller, or vary height_m in other bounds",
         )])  # fmt: skip
 
 
 _WANTED: dict[Region, str] = {
-    "open": "ground of the survey area with nothing on it or above it, margin_m from obstacles",
+    "open": "ground of the survey area with nothing on it or above it, near_m from obstacles",
     "indoors": "the inside of a hollow obstacle (wall_m in the site's file) that stands on the ground, margin_m from "
     "its walls",
     "behind_walls": "ground of the survey area within near_m of a wall that rises 1 m above the source",

@@ -29,8 +29,8 @@ class Stream:
 
     def numbers(self, count: int) -> NDArray[np.float64]:
         """The next ``count`` numbers; 53 bits each, neither 0 nor 1."""
-        made: NDArray[np.float64] = ((np.asarray(self._bits.random_raw(count)) >> np.uint64(11)) + 0.5) * _SCALE
-        return np.minimum(made, 1.0 - _SCALE)
+        words = np.asarray(self._bits.random_raw(count), np.uint64) >> np.uint64(11)
+        return np.minimum((words.astype(np.float64) + 0.5) * _SCALE, 1.0 - _SCALE)
 
     def number(self) -> float:
         """The next number."""

@@ -1,6 +1,6 @@
 """A scenario built at its site: rolled out as whole missions, or stepped by hand."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim import randomness
-from swarmsim.config.errors import InputError, raise_if_any
-from swarmsim.config.family import canonical
+from swarmsim.config.errors import InputError, Problem, raise_if_any
+from swarmsim.config.family import CAN_VARY, canonical, ends_of
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.site_checks import check_site
 from swarmsim.config.values import with_values
@@ -103,6 +103,24 @@ class Simulation:
         self._check_alike((world, plan), self.draws.values)
         return world
 
+    def check_family(self) -> None:
+        """Build the mission at the ends of every distribution, one at a time; raises `InputError` where that fails."""
+        own = {path: value for path, (value,) in self.draws.values.items()}
+        first = {varied.key: varied for varied in reversed(self.scenario.family)}
+        problems: list[Problem] = []
+        for key, varied in first.items():
+            for value in ends_of(varied):
+                try:
+                    built = _built(with_values(self.scenario, own | {varied.path: value}), self.site_model)
+                    self._check_alike(built, [key])
+                except InputError as error:
+                    told, place = error.problems[0], ("vary", key, varied.distribution.kind)
+                    hints = {"allowed": told.allowed or CAN_VARY, "suggestion": told.suggestion}
+                    message = f"draws a value with which the mission is wrong: {told.message}"
+                    problems.append(self.scenario.problem(place, message, given=str(value), **hints))
+                    break
+        raise_if_any(problems)
+
     def rollout(
         self,
         seeds: int | Sequence[int] | np.ndarray,
@@ -186,7 +204,7 @@ class Simulation:
         worlds = [replace(world, layout=layout) for world, _ in pairs]
         return batch.spread(worlds), batch.spread([plan for _, plan in pairs])
 
-    def _check_alike(self, built: tuple[World, Plan], values: Mapping[str, Any]) -> None:
+    def _check_alike(self, built: tuple[World, Plan], values: Iterable[str]) -> None:
         """Refuse what would need another program: other sizes, or other static choices."""
         for own, other in zip((self.world, self.plan), built, strict=True):
             leaves, structure = jax.tree.flatten(own)

@@ -34,7 +34,6 @@ class Regions:
         ground = self._ground
         self._solid = ~ground.porous & np.all(ground.half > 0, axis=1)
         self._cells: dict[Any, NDArray[np.int64]] = {}
-        self._overhead = ground.surface - ground.terrain > OVERHEAD_M
 
     def draw(self, region: Region, place: PlaceIn, height_m: float, numbers: Numbers, taken: Floats) -> Floats | None:
         """A place [2] in ``region`` for a source at ``height_m``, away from the places ``taken`` [m, 2].
@@ -61,7 +60,7 @@ class Regions:
         else:
             suits = in_polygon(xy, ground.area)
         tests: dict[Region, tuple[Callable[..., NDArray[np.bool_]], ...]] = {
-            "open": (self._free, self._in_the_open),
+            "open": (self._in_the_open,),
             "indoors": (self._inside,),
             "behind_walls": (self._free, self._hidden),
         }
@@ -76,7 +75,7 @@ class Regions:
         if region == "indoors":
             rooms = self._rooms(place)
             return partial(self._in_rooms, rooms, place) if len(rooms) else None
-        key = place.near_m if region == "behind_walls" else region != "anywhere"
+        key = (region == "behind_walls", place.near_m if region == "behind_walls" else region != "anywhere")
         if (cells := self._cells.get(key)) is None:
             of = self._near_walls(place.near_m) if region == "behind_walls" else self._cells_of(region != "anywhere")
             cells = self._cells[key] = of
@@ -118,24 +117,29 @@ class Regions:
         return inside
 
     def _free(self, place: PlaceIn, points: Floats) -> NDArray[np.bool_]:
-        """Whether points [n, 3] are outdoors, the margin away from all boxes, with nothing above them."""
-        ground = self._ground
-        real = np.all(ground.half > 0, axis=1)
-        outside = -ground.depth(points)[..., :2]
-        apart = np.linalg.norm(np.maximum(outside, 0.0), axis=-1)
-        clear = np.all(~real | ((apart >= place.margin_m) & np.any(outside > 0, axis=-1)), axis=1)
-        rows, columns = self._overhead.shape
-        cell = np.clip(((points[:, :2] - ground.low) / ground.cell).astype(int), 0, [columns - 1, rows - 1])
-        free: NDArray[np.bool_] = clear & ~self._overhead[cell[:, 1], cell[:, 0]]
+        """Whether points [n, 3] are outdoors, the margin away from all boxes, those overhead included."""
+        free: NDArray[np.bool_] = self._apart(points) >= place.margin_m
         return free
 
+    def _apart(self, points: Floats) -> Floats:
+        """Horizontal distance [n] of points [n, 3] to the nearest box, whatever its height; negative within one."""
+        real = np.all(self._ground.half > 0, axis=1)
+        outside = -self._ground.depth(points)[:, real, :2]
+        distance = np.linalg.norm(np.maximum(outside, 0.0), axis=-1)
+        signed = np.where(distance > 0.0, distance, outside.max(axis=-1))
+        return np.min(signed, axis=1, initial=np.inf)
+
     def _in_the_open(self, place: PlaceIn, points: Floats) -> NDArray[np.bool_]:
-        """Whether points [n, 3] lie the margin away from what stops a rover: obstacles, zones, the border."""
+        """Whether points [n, 3] have nothing overhead and are ``near_m`` from obstacles, closed zones, the border."""
         ground = self._ground
         rows, columns = ground.clearance.shape
         cell = np.clip(((points[:, :2] - ground.low) / ground.cell).astype(int), 0, [columns - 1, rows - 1])
-        drivable: NDArray[np.bool_] = ground.clearance[cell[:, 1], cell[:, 0]] >= max(place.margin_m, 1e-6)
-        return drivable
+        at = (cell[:, 1], cell[:, 0])
+        overhead = ground.surface[at] - ground.terrain[at] > OVERHEAD_M
+        free: NDArray[np.bool_] = (
+            (self._apart(points) >= place.near_m) & (ground.clearance[at] >= place.near_m) & ~overhead
+        )
+        return free
 
     def _hidden(self, place: PlaceIn, points: Floats) -> NDArray[np.bool_]:
         """Whether a wall within ``near_m`` of points [n, 3] hides them from a sector of the horizon."""

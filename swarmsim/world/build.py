@@ -14,6 +14,7 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.flight import Failsafe
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
+from swarmsim.kept import kept
 from swarmsim.physics.multirotor import check_time_step
 from swarmsim.pytree import on_host
 from swarmsim.radiation.detector import Detector, Source, build_detector
@@ -257,25 +258,11 @@ def _counter(scenario: Scenario, specs: Sequence[Spec], timing: Timing, library:
 
 def _detector(scenario: Scenario, model: str, library: Library) -> Detector:
     mount = next(s.detector for s in scenario.vehicles if s.detector is not None and s.detector.model == model)
-    return _detector_of(scenario.detectors[model], mount, library, scenario.mission.detection)
+    return _kept_detector(scenario.detectors[model], mount, library, scenario.mission.detection)
 
 
-_DETECTORS_KEPT = 8
-_detectors: list[tuple[tuple[Any, ...], Detector]] = []
-
-
-def _detector_of(*of: Any) -> Detector:
-    """`build_detector`, whose tables take a second, with its last results kept: missions of a family share theirs.
-
-    The arguments are compared, not hashed: their models hold mappings.
-    """
-    for known, detector in _detectors:
-        if known == of:
-            return detector
-    detector = build_detector(*of)
-    _detectors.append((of, detector))
-    del _detectors[:-_DETECTORS_KEPT]
-    return detector
+_kept_detector = kept(8)(build_detector)
+"""Its tables take a second: missions of a family share them."""
 
 
 def _exposure_ticks(scenario: Scenario, model: str, timing: Timing) -> int:
