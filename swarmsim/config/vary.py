@@ -47,11 +47,12 @@ class Normal(Model):
 class PlaceIn(Model):
     """A place of a source by region of the site; with several regions one is drawn first, by ``weights``.
 
-    All but ``anywhere`` lie in the site's survey area. ``open``: ground with nothing on it or above it, ``near_m``
-    away from obstacles. ``indoors``: in a hollow box that stands on the ground (a building, a container), ``margin_m``
-    from its walls; every box is as likely, and every place in it. ``behind_walls``: outside, between
-    ``margin_m`` and ``near_m`` from a wall that rises 1 m above the source and hides an eighth of the horizon. ``survey_area`` and ``anywhere``: wherever a source can lie, not within a
-    solid thing or a wall. Sources keep ``apart_m`` from each other, horizontally.
+    All but ``anywhere`` lie in the site's survey area. ``open``: ground with nothing on it or above it, ``near_m`` away
+    from obstacles. ``indoors``: in a hollow box that stands on the ground (a building, a container), ``margin_m`` from
+    its walls; every box is as likely, and every place in it. ``behind_walls``: outside, between ``margin_m`` and
+    ``near_m`` from a wall that rises 1 m above the source and hides an eighth of the horizon. ``survey_area`` and
+    ``anywhere``: wherever a source can lie, not within a solid thing or a wall. Sources keep ``apart_m`` from each
+    other, horizontally.
     """
 
     region: Region | Annotated[tuple[Region, ...], Field(min_length=1, max_length=len(REGIONS))]

@@ -109,10 +109,9 @@ class Drawer:
             if crowded is None:
                 return row | places, regions
             self._check_region(crowded, regions[crowded.path], float(sources[_source(crowded.place)]["height_m"]))
-            apart_m = crowded.distribution.place.apart_m if crowded.distribution.place else 0.0
         raise InputError([self._scenario.problem(
-            ("vary", crowded.key, "place"),
-            f"'{crowded.path}' of the mission of seed {seed} finds no place {apart_m:g} m from the other sources",
+            ("vary", placed[0].key, "place"),
+            f"the {there} sources of the mission of seed {seed} find no places so far apart",
             suggestion="make apart_m smaller, add a region, or draw fewer sources",
         )])  # fmt: skip
 

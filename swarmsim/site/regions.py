@@ -136,9 +136,8 @@ class Regions:
         cell = np.clip(((points[:, :2] - ground.low) / ground.cell).astype(int), 0, [columns - 1, rows - 1])
         at = (cell[:, 1], cell[:, 0])
         overhead = ground.surface[at] - ground.terrain[at] > OVERHEAD_M
-        free: NDArray[np.bool_] = (
-            (self._apart(points) >= place.near_m) & (ground.clearance[at] >= place.near_m) & ~overhead
-        )
+        apart = np.minimum(self._apart(points), ground.clearance[at])
+        free: NDArray[np.bool_] = (apart >= place.near_m) & ~overhead
         return free
 
     def _hidden(self, place: PlaceIn, points: Floats) -> NDArray[np.bool_]:
@@ -152,7 +151,7 @@ class Regions:
             hidden[:, k] = np.any(rise & self._meets(standing, points, angle, place.near_m), axis=1)
         run = np.concatenate([hidden, hidden[:, : HIDDEN_MIN - 1]], axis=1)
         windows = np.lib.stride_tricks.sliding_window_view(run, HIDDEN_MIN, axis=1)
-        sector: NDArray[np.bool_] = windows.all(axis=2).any(axis=1)
+        sector: NDArray[np.bool_] = np.any(np.all(windows, axis=2), axis=1)
         return sector
 
     def _meets(self, boxes: NDArray[np.int64], points: Floats, angle: float, reach_m: float) -> NDArray[np.bool_]:
