@@ -72,6 +72,8 @@ def run(
         swarmsim run configs/missions/recon.yaml --seed 7 --out runs/seven
         swarmsim run recon --missions 256
         swarmsim run recon --set phases.survey.settings.altitude_m=30 --set wind.speed_m_s=5
+        swarmsim run random_recon --missions 256
+        swarmsim run random_recon --seed 17 --set vary.wind.speed_m_s=null --set wind.speed_m_s=3
         swarmsim run runs/recon/scenario.yaml --out runs/again
         swarmsim run recon --strict
 
@@ -87,7 +89,8 @@ def run(
         How many missions to fly in one batch, with seeds N, N+1, …; 1 by default.
     overrides
         Change a value of the mission, as path=value; may be given again and again. Items of a list are named by
-        index or by their name, e.g. vehicles.uav1.heading_deg=90.
+        index or by their name, e.g. vehicles.uav1.heading_deg=90. What is drawn for every mission is set under
+        vary, e.g. 'vary.wind.speed_m_s={uniform: [0, 5]}', or null to draw it no more.
     force
         Replace the results of an earlier run.
     strict
@@ -176,6 +179,37 @@ def check(*paths: Path) -> None:
     from swarmsim.cli.files import check_files
 
     check_files(paths)
+
+
+@command
+def draw(
+    scenario: str,
+    *,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END))] = None,
+    missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1000))] = 4,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+) -> None:
+    """Show what missions of a family draw (`vary` of a mission file), without flying them.
+
+    For example:
+        swarmsim draw random_recon
+        swarmsim draw random_recon --seed 17 --missions 1
+        swarmsim draw recon --set 'vary.wind.speed_m_s={uniform: [0, 5]}'
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission, or a mission file.
+    seed
+        Seed of the first mission, instead of the one in the file.
+    missions
+        How many missions, with seeds N, N+1, …; 4 by default.
+    overrides
+        Change a value of the mission, as path=value.
+    """
+    from swarmsim.cli.files import print_draws
+
+    print_draws(scenario, seed, missions, overrides)
 
 
 @command

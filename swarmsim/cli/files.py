@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from swarmsim.atomic_folder import atomic_folder
+from swarmsim.cli.run import value_text
 from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS
@@ -39,20 +40,27 @@ def check_files(paths: Sequence[Path]) -> None:
             except InputError as error:
                 problems += [problem for problem in error.problems if problem not in problems]
             else:
-                sys.stdout.write(f"ok  {shown_path(file)} ({kind.removesuffix('s')})\n")
+                sys.stdout.write(f"ok  {shown_path(file)} ({kind})\n")
                 sys.stdout.writelines(f"    warning: {warning}\n" for warning in warnings)
     raise_if_any(problems)
 
 
 def check_file(path: Path) -> tuple[str, list[str]]:
-    """Validate one file with all that it refers to; its kind, and warnings of it. Raises `InputError`."""
+    """Validate one file with all that it refers to; what it is, and warnings of it. Raises `InputError`."""
     kind = kind_of_file(path)
     warnings: list[str] = []
     if kind == "missions":
         from swarmsim.config.scenario import load_scenario
         from swarmsim.config.site_checks import check_site
 
-        raise_if_any(check_site(load_scenario(path)))
+        scenario = load_scenario(path)
+        if scenario.family:
+            from swarmsim.runtime.run import build
+
+            build(scenario)
+            varied = ", ".join(dict.fromkeys(v.key for v in scenario.family))
+            return f"mission, a family that varies {varied}", warnings
+        raise_if_any(check_site(scenario))
     elif kind == "sites":
         load_named(kind, path)
         from swarmsim.site import load_site
@@ -60,7 +68,25 @@ def check_file(path: Path) -> tuple[str, list[str]]:
         warnings = load_site(path, tuple(load_all("materials", path))).report["warnings"]
     else:
         load_named(kind, path)
-    return kind, warnings
+    return kind.removesuffix("s"), warnings
+
+
+def print_draws(name: str, seed: int | None, missions: int, overrides: Sequence[str]) -> None:
+    """Print what missions of a family draw, one column each."""
+    from swarmsim.config.scenario import load_scenario
+    from swarmsim.runtime.run import build
+
+    scenario = load_scenario(name, overrides, seed)
+    if not scenario.family:
+        hint = "add vary to it, e.g. --set 'vary.wind.speed_m_s={uniform: [0, 5]}'"
+        raise InputError.of("is a single mission: nothing is drawn for it", path="vary", given=name, suggestion=hint)
+    first = scenario.mission.seed
+    draws = build(scenario).draw(range(first, first + missions))
+    told = [draws.told(index) for index in range(missions)]
+    table = Table("what", *(f"seed {each}" for each in draws.seeds), title=name, title_justify="left")
+    for path in dict.fromkeys(path for row in told for path in row):
+        table.add_row(path, *(value_text(row[path]) if path in row else "" for row in told))
+    Console(width=None if sys.stdout.isatty() else 40 + 24 * missions).print(table)
 
 
 def kind_of_file(path: Path) -> str:

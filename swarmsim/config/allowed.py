@@ -38,6 +38,10 @@ class Shape:
         schema = self.at(place, data)
         return None if schema is None else self._words(schema)
 
+    def words(self, schema: Schema) -> str:
+        """What a schema without references allows, in words."""
+        return self._words(schema)
+
     def choices(self, place: Place, data: Any) -> list[str]:
         """Words to choose from at ``place``; empty where there are none."""
         schema = self.at(place, data) or {}

@@ -147,7 +147,8 @@ def _merge(
         known = _place_in(into, source, old, key, there)
         here = (*place, known)
         below = old.get(known) if isinstance(old, dict) else old[known]
-        if isinstance(value, dict) and (isinstance(below, dict) or _items_named(below)):
+        whole = place == ("vary",)  # a distribution replaces another one, of whatever kind
+        if not whole and isinstance(value, dict) and (isinstance(below, dict) or _items_named(below)):
             into.marks[here] = source.marks[there]
             _merge(into, source, below, value, here, there, replaced)
         else:

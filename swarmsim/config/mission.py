@@ -7,6 +7,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from swarmsim.config.base import Delay, Duration, Fraction, Gap, Length, Model, Name, Vec2
 from swarmsim.config.flight import Failsafes, FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
+from swarmsim.config.vary import SOURCES_MAX, VARIED_MAX, Distribution, VariedPath
 from swarmsim.config.vehicles import Vehicle
 
 TEAM_MAX = 2000  # vehicles of a mission, formations expanded
@@ -228,8 +229,9 @@ class Mission(Model):
     """A scenario (``configs/missions/<name>.yaml``).
 
     Without ``mapping`` there is no radiation map, without ``localisation`` no source is estimated, without
-    ``identification`` no nuclide is named. ``versions`` says what wrote a resolved scenario (package -> version); it
-    changes nothing in the mission.
+    ``identification`` no nuclide is named. ``vary`` makes a family of it: each mission draws the values at these dotted
+    paths (``wind.speed_m_s``, ``sources.*.activity_mbq``) from its own seed. ``versions`` says what wrote a resolved
+    scenario (package -> version); it changes nothing in the mission.
     """
 
     name: Name
@@ -239,7 +241,7 @@ class Mission(Model):
     engine: Literal["mjx", "analytic"] = "mjx"
     detection: Literal["physical", "paper_ideal"] = "physical"
     timing: Timing = Timing()
-    sources: tuple[Source, ...] = Field(max_length=16)
+    sources: tuple[Source, ...] = Field(max_length=SOURCES_MAX)
     vehicles: tuple[TeamMember, ...] = Field(min_length=1, max_length=TEAM_MAX)
     wind: Wind = Wind()
     background: BackgroundField = BackgroundField()
@@ -251,5 +253,6 @@ class Mission(Model):
     localisation: Localisation | None = None
     identification: Identification | None = None
     phases: tuple[Phase, ...] = Field(min_length=1, max_length=PHASES_MAX)
+    vary: dict[VariedPath, Distribution | None] = Field(default_factory=dict, max_length=VARIED_MAX)
     definitions: Definitions = Definitions()
     versions: dict[str, str] = Field(default_factory=dict)

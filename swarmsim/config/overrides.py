@@ -8,6 +8,7 @@ from swarmsim.config.documents import Document, Mark, Place, dotted, parse_value
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.former import former_override
 from swarmsim.config.names import did_you_mean, one_of
+from swarmsim.config.vary import DISTRIBUTIONS
 
 ORIGIN = "--set"
 
@@ -41,10 +42,11 @@ def _apply(document: Document, text: str, shape: Shape) -> None:
     former = former_override(tuple(steps), value, document.data)
     if former is not None and shape.at((steps[0],), document.data) is None:
         raise InputError([_at(tuple(steps), f"is now {former[0]}", suggestion=f"write {ORIGIN} {former[1]}")])
+    steps = _with_whole_path(steps)
     place: Place = ()
     node: Any = document.data
     for i, step in enumerate(steps):
-        known = _known_step(node, step, place, document, shape)
+        known = known_step(node, step, place, document, shape)
         place = (*place, known)
         if i == len(steps) - 1:
             node[known] = value
@@ -55,7 +57,15 @@ def _apply(document: Document, text: str, shape: Shape) -> None:
     document.replace(place, {place: Mark(ORIGIN, None)})
 
 
-def _known_step(node: Any, step: str, place: Place, document: Document, shape: Shape) -> str | int:
+def _with_whole_path(steps: list[str]) -> list[str]:
+    """The steps of ``vary.wind.speed_m_s.uniform``, where the path of what is varied is a single one."""
+    if steps[0] != "vary" or len(steps) < 3:
+        return steps
+    end = next((i for i, step in enumerate(steps) if i > 1 and step in DISTRIBUTIONS), len(steps))
+    return ["vary", ".".join(steps[1:end]), *steps[end:]]
+
+
+def known_step(node: Any, step: str, place: Place, document: Document, shape: Shape) -> str | int:
     """The key or index that ``step`` means in ``node``; raises with the nearest when there is none."""
     here = dotted(place) or "the top level"
     if isinstance(node, list):

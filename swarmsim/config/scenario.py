@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -19,6 +19,7 @@ from swarmsim.config.checks import (
 )
 from swarmsim.config.documents import Document, Place, dump_yaml
 from swarmsim.config.errors import InputError, Problem, raise_if_any
+from swarmsim.config.family import Varied, add_sources, read_family, set_and_varied, varied_paths
 from swarmsim.config.load import load_named, read_document
 from swarmsim.config.mission import Mission, TeamMember
 from swarmsim.config.overrides import ORIGIN, apply_overrides
@@ -50,6 +51,7 @@ class Scenario:
     site_file: Path  # site.yaml; the site's mesh or elevation model is named relative to its folder
     mission_file: Path | None = field(compare=False)  # policies in files are named relative to its folder
     document: Document = field(repr=False, compare=False)  # where each value stands, for messages
+    family: tuple[Varied, ...] = ()  # what is drawn for every mission: ``mission.vary`` with its paths written out
 
     @cached_property
     def groups(self) -> dict[str, tuple[int, ...]]:
@@ -119,6 +121,8 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
         apply_overrides(document, overrides, shape_of(Mission))
     except InputError as error:
         problems += error.problems
+    problems += _bring_in_definitions(document, varied_paths(document), path)
+    problems += set_and_varied(document, overrides)
     return resolve(document, path, problems)
 
 
@@ -130,8 +134,13 @@ def scenario_of(mission: Mission, near: Path | None = None) -> Scenario:
     return resolve(Document(mission.model_dump(mode="json", exclude_none=True)), near, [])
 
 
-def resolve(document: Document, near: Path | None, problems: list[Problem]) -> Scenario:
-    """The scenario of a mission's document; ``problems`` are those found already. Raises `InputError`."""
+def resolve(document: Document, near: Path | None, problems: list[Problem], like: "Scenario | None" = None) -> Scenario:
+    """The scenario of a mission's document; ``problems`` are those found already. Raises `InputError`.
+
+    What is looked up by name (vehicles, detectors, nuclides, materials, the site) is taken from the scenario ``like``
+    where that names the same, instead of being read from its files again.
+    """
+    add_sources(document)
     mission: Mission | None = None
     try:
         mission = validate(document, Mission)
@@ -139,15 +148,39 @@ def resolve(document: Document, near: Path | None, problems: list[Problem]) -> S
     except InputError as error:
         problems += error.problems
     settings, of_settings = read_settings(document, near)
+    family, of_family = read_family(document, near) if mission is not None else ((), [])
+    of_settings += of_family
     at_fault = {problem.path for problem in problems}
     others = (*check_references(document, near), *of_settings)
     problems += [problem for problem in others if problem.path not in at_fault]
     raise_if_any(sorted(problems, key=lambda p: (p.file is None, p.file != ORIGIN, p.file or "", p.line or 0)))
     assert mission is not None
     complete = tuple(each for each in settings if each is not None)
-    scenario = _look_up(_with_settings(mission, complete), complete, document, near)
+    mission = _with_settings(mission, complete)
+    if like is not None and _names_the_same(mission, like.mission):
+        members, entries = expand_team(mission)
+        types = {member.type: vehicle for member, vehicle in zip(like.members, like.vehicles, strict=True)}
+        scenario = replace(
+            like,
+            mission=mission,
+            members=members,
+            entries=entries,
+            vehicles=tuple(types[member.type] for member in members),
+            settings=complete,
+            mission_file=near,
+            document=document,
+            family=family,
+        )
+    else:
+        scenario = replace(_look_up(mission, complete, document, near), family=family)
     raise_if_any(check_consistency(scenario))
     return scenario
+
+
+def _names_the_same(mission: Mission, other: Mission) -> bool:
+    """Whether two missions look up the same vehicles, detectors, nuclides, materials and site."""
+    types, others = ({member.type for member in each.vehicles} for each in (mission, other))
+    return mission.site == other.site and mission.definitions == other.definitions and types == others
 
 
 def _with_settings(mission: Mission, settings: tuple[PolicySettings, ...]) -> Mission:
@@ -220,7 +253,7 @@ def _found_from_anywhere(policy: str, near: Path | None) -> str:
 
 
 def _bring_in_definitions(document: Document, overrides: Sequence[str], near: Path) -> list[Problem]:
-    """Copy into ``definitions`` what overrides change there: ``definitions.vehicles.tarot_t650.mass_kg=4``."""
+    """Copy into ``definitions`` what overrides or `vary` change: ``definitions.vehicles.tarot_t650.mass_kg=4``."""
     problems: list[Problem] = []
     for text in overrides:
         steps = text.partition("=")[0].strip().split(".")

@@ -35,15 +35,16 @@ def check_site(scenario: Scenario, model: SiteModel | None = None) -> list[Probl
         from swarmsim.site import load_site
 
         model = load_site(scenario.site_file, tuple(scenario.materials))
-    ground = _Ground(model.site, scenario)
+    ground = Ground(model.site, scenario)
     checks = (_check_sources, _check_vehicles, _check_areas, _check_points)
     return first_problems(problem for check in checks for problem in check(scenario, ground))
 
 
-class _Ground:
+class Ground:
     """The site's arrays on the host."""
 
     def __init__(self, site: Site, scenario: Scenario):
+        self.site = site
         self.cell = float(site.cell_m)
         self.terrain = np.asarray(site.terrain_m, float)
         self.surface = np.asarray(site.surface_m, float)
@@ -83,34 +84,52 @@ class _Ground:
         window = np.s_[low : high + 1, left : right + 1]
         return float(np.max(self.surface[window] - self.terrain[window]))
 
-    def least_clearance(self, xy: Floats) -> float:
-        """Least clearance of a rover at points [p, 2], bilinear as the bumpers have it."""
+    def clearances(self, xy: Floats) -> Floats:
+        """Clearance [p] at points [p, 2], bilinear as the bumpers have it."""
         import jax.numpy as jnp
 
         from swarmsim.site import sample
 
-        return float(np.min(np.asarray(sample(self.site.clearance_m, self.site, jnp.asarray(xy, jnp.float32)))))
+        return np.asarray(sample(self.site.clearance_m, self.site, jnp.asarray(xy, jnp.float32)), float)
 
-    def depth(self, point: Floats) -> Floats:
-        """How deep a point [3] lies within each box, along the box's own axes [K, 3]; < 0 outside."""
-        offset = point - self.centre
-        along = offset[:, 0] * self.axis[:, 0] + offset[:, 1] * self.axis[:, 1]
-        across = -offset[:, 0] * self.axis[:, 1] + offset[:, 1] * self.axis[:, 0]
-        depth: Floats = self.half - np.abs(np.stack([along, across, offset[:, 2]], axis=1))
+    def least_clearance(self, xy: Floats) -> float:
+        """Least clearance of a rover at points [p, 2]."""
+        return float(np.min(self.clearances(xy)))
+
+    def above(self, xy: Floats, height_m: float) -> Floats:
+        """Points [n, 3] that lie ``height_m`` above the terrain at ``xy`` [n, 2]."""
+        from swarmsim.site.model import height_at
+
+        return np.concatenate([xy, (height_at(self.site, xy) + height_m)[:, None]], axis=1)
+
+    def depth(self, points: Floats) -> Floats:
+        """How deep points [..., 3] lie within each box, along the box's own axes [..., K, 3]; < 0 outside."""
+        offset = points[..., None, :] - self.centre
+        along = offset[..., 0] * self.axis[:, 0] + offset[..., 1] * self.axis[:, 1]
+        across = -offset[..., 0] * self.axis[:, 1] + offset[..., 1] * self.axis[:, 0]
+        depth: Floats = self.half - np.abs(np.stack([along, across, offset[..., 2]], axis=-1))
         return depth
 
+    def blocked(self, points: Floats) -> NDArray[np.bool_]:
+        """Which boxes [..., K] points [..., 3] lie in where no source can: solid ones, and walls of hollow ones."""
+        depth = self.depth(points)
+        within = np.all(depth > 0, axis=-1)
+        in_cavity = (self.wall > 0) & np.all(depth >= self.wall[:, None], axis=-1)
+        blocked: NDArray[np.bool_] = within & ~in_cavity & ~self.porous
+        return blocked
 
-def _check_sources(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
+
+def _check_sources(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
+    drawn = {varied.place[1] for varied in scenario.family if varied.distribution.place is not None}
     for i, source in enumerate(scenario.mission.sources):
+        if i in drawn:
+            continue
         place: Place = ("sources", i, "position_m")
         xy, given = np.array(source.position_m), str(list(source.position_m))
         if not ground.holds(xy):
             yield scenario.problem(place, "the source lies outside the site", given=given, allowed=ground.extent)
             continue
-        depth = ground.depth(np.array([*xy, ground.cell_value(ground.terrain, xy) + source.height_m]))
-        within = np.all(depth > 0, axis=1)
-        in_cavity = (ground.wall > 0) & np.all(depth >= ground.wall[:, None], axis=1)
-        blocked = np.flatnonzero(within & ~in_cavity & ~ground.porous)
+        blocked = np.flatnonzero(ground.blocked(ground.above(xy[None], source.height_m)[0]))
         if blocked.size:
             k = int(blocked[0])
             what = "the wall of a building" if ground.wall[k] > 0 else "a solid obstacle"
@@ -124,7 +143,7 @@ def _check_sources(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
             )
 
 
-def _check_vehicles(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
+def _check_vehicles(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     """Starts that do not fit; the members of a formation are told once for each kind of fault."""
     found: dict[tuple[int, str], list[tuple[int, dict[str, str]]]] = {}
     for i in range(len(scenario.members)):
@@ -143,7 +162,7 @@ def _check_vehicles(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
         )
 
 
-def _start_fault(scenario: Scenario, ground: _Ground, i: int) -> tuple[str, dict[str, str]] | None:
+def _start_fault(scenario: Scenario, ground: Ground, i: int) -> tuple[str, dict[str, str]] | None:
     """What is wrong with the start of member ``i``, as the end of a sentence, and the details of the problem."""
     vehicle, xy = scenario.vehicles[i], np.array(scenario.members[i].position_m)
     radius = footprint_radius_m(vehicle)
@@ -185,7 +204,7 @@ def _outline(scenario: Scenario, i: int) -> Floats:
     return own @ np.array([[cos, sin], [-sin, cos]]) + np.array(member.position_m)
 
 
-def _check_areas(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
+def _check_areas(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     """Survey areas beyond the site, or without room for a line."""
     for i, settings in enumerate(scenario.settings):
         if not isinstance(settings, ParallelLines):
@@ -211,7 +230,7 @@ def _check_areas(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
             )
 
 
-def _check_points(scenario: Scenario, ground: _Ground) -> Iterator[Problem]:
+def _check_points(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     """Waypoints and targets beyond the site."""
     for i, settings in enumerate(scenario.settings):
         points: list[tuple[Place, tuple[float, float]]] = []

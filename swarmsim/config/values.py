@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from swarmsim.config.allowed import shape_of
+from swarmsim.config.documents import Document
 from swarmsim.config.mission import Mission
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.scenario import Scenario, resolve
@@ -14,12 +15,18 @@ from swarmsim.config.scenario import Scenario, resolve
 def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
     """The scenario with ``values`` at dotted paths (``sources.0.activity_mbq``), checked as a whole.
 
-    Raises `InputError` with everything that is wrong with the paths, the values and what they make of the scenario.
+    It is a single scenario: of a family, nothing is drawn any more. Raises `InputError` with everything that is wrong
+    with the paths, the values and what they make of the scenario.
     """
-    document = copy.deepcopy(scenario.document)
+    own = scenario.document
+    data = {key: copy.deepcopy(value) for key, value in own.data.items() if key not in ("vary", "definitions")}
+    if "definitions" in own.data:  # the largest part, which only values in it change
+        changed = any(path.startswith("definitions") for path in values)
+        data["definitions"] = copy.deepcopy(own.data["definitions"]) if changed else own.data["definitions"]
+    document = Document(data, dict(own.marks), own.files)
     texts = [f"{path}={json.dumps(plain(value))}" for path, value in values.items()]
     apply_overrides(document, texts, shape_of(Mission))
-    return resolve(document, scenario.mission_file, [])
+    return resolve(document, scenario.mission_file, [], like=scenario)
 
 
 def plain(value: Any) -> Any:

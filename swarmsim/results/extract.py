@@ -76,6 +76,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
         warnings=(CROWDED,) if bool(end.world.crowded) else (),
+        drawn=batch.draws.told(index),
     )
 
 
@@ -257,15 +258,15 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
 
 
 def true_sources(simulation: Simulation, world: World) -> tuple[TrueSource, ...]:
-    """The sources of one mission's world, whatever values it was given."""
-    sources, names = world.sources, _nuclides(simulation)
+    """The sources of one mission's world, whatever values it was given; one without activity is not there."""
+    sources, names = world.sources, tuple(simulation.scenario.nuclides)
     return tuple(
         TrueSource(
-            nuclide=names[int(sources.nuclide[k])] if names else spec.nuclide,
+            nuclide=names[int(sources.nuclide[k])],
             position_m=np.asarray(sources.position_m[k], float),
             activity_mbq=1e-6 * float(sources.activity_bq[k]),
         )
-        for k, spec in enumerate(simulation.scenario.mission.sources)
+        for k in np.flatnonzero(np.asarray(sources.activity_bq) > 0.0)
     )
 
 

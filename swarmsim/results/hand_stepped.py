@@ -111,6 +111,7 @@ def record_steps(simulation: Simulation, frames: Frame, seed: int, world: World 
         events=tuple(_events(simulation, frames)),
         finding="stepped by hand, so nothing was estimated",
         warnings=(CROWDED,) if frames.crowded.any() else (),
+        drawn=simulation.draws.told(0) if world is None else {},
     )
 
 

@@ -1,5 +1,6 @@
 """What one flown mission leaves behind, as numpy arrays on the host: the input of all that is written or shown."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -163,6 +164,7 @@ class MissionRecord:
     status: str = "not_sought"  # what that is worth, see `swarmsim.results.status.Status`
     covered: float | None = None  # share of the survey area that was measured; None where nothing was sought
     warnings: tuple[str, ...] = ()  # what makes parts of the result doubtful
+    drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
 
     def phase(self, name: str) -> Phase | None:
         """The phase of a name; None where it did not begin."""

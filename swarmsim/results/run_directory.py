@@ -217,7 +217,7 @@ def missions_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
         values = [row.get(key) for row in rows]
         empty = all(v is None for v in values)
         columns[key] = (
-            pa.array(values, pa.string() if key == "nuclide" else pa.float64()) if empty else pa.array(values)
+            pa.array(values, pa.string() if key.endswith("nuclide") else pa.float64()) if empty else pa.array(values)
         )
     return pa.table(columns)
 

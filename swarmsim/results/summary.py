@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmsim.families.draw import columns
 from swarmsim.results.record import (
     Estimate,
     Event,
@@ -84,6 +85,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
             "name": named(spectrum),
             "confidence": None if spectrum is None else float(spectrum.confidence),
         },
+        "drawn": dict(record.drawn),
         "true_sources": [
             {"nuclide": s.nuclide, "position_m": _plain(s.position_m), "activity_mbq": float(s.activity_mbq)}
             for s in record.sources
@@ -227,6 +229,7 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     """
     record = record.finite()
     row: dict[str, Any] = {"seed": int(record.seed), "status": record.status, "finding": record.finding}
+    row |= columns(record.drawn)
     for phase in record.phases:
         row |= {f"{phase.name}_{key}": value for key, value in _measured(record, phase).items()}
     row["duration_s"] = float(record.end_s)

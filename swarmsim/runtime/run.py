@@ -25,7 +25,9 @@ def build(scenario: Scenario) -> Simulation:
     """
     site_model = load_site(scenario.site_file, tuple(scenario.materials))
     raise_if_any(check_site(scenario, site_model))
-    return Simulation(scenario, site_model)
+    simulation = Simulation(scenario, site_model)
+    simulation.check_family()
+    return simulation
 
 
 def run(

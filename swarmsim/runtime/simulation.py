@@ -1,6 +1,6 @@
 """A scenario built at its site: rolled out as whole missions, or stepped by hand."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -10,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim import randomness
-from swarmsim.config.errors import InputError
+from swarmsim.config.errors import InputError, Problem, raise_if_any
+from swarmsim.config.family import CAN_VARY, canonical, ends_of
 from swarmsim.config.scenario import Scenario
+from swarmsim.config.site_checks import check_site
 from swarmsim.config.values import with_values
+from swarmsim.families.draw import Drawer, Draws, with_given
 from swarmsim.missions.begin import begin_mission, begin_phase
 from swarmsim.missions.knowledge import Conclusion, conclude, gathered, survey
 from swarmsim.missions.plan import Plan
@@ -57,6 +60,7 @@ class MissionBatch:
     segments: tuple[Segment, ...]
     conclusion: Conclusion | None  # [B, …]; None where the mission estimates no source
     clock: Clock
+    draws: Draws  # what differs between them besides their seeds
 
     @property
     def simulated_s(self) -> float:
@@ -67,24 +71,55 @@ class MissionBatch:
 class Simulation:
     """A scenario built at its site.
 
-    ``world`` and ``plan`` are one mission's, for use with the pure functions of `swarmsim.world.step`. Roll out as
-    often as you like, with whatever values: what has been compiled is kept, also for other simulations that differ
-    from this one in values only.
+    ``world`` and ``plan`` are one mission's, for use with the pure functions of `swarmsim.world.step`; of a family
+    (`vary` of the mission) those of the scenario's own seed. Roll out as often as you like, with whatever values: what
+    has been compiled is kept, also for other simulations that differ from this one in values only.
     """
 
     def __init__(self, scenario: Scenario, site_model: SiteModel):
         """Build the arrays; nothing is compiled yet.
 
-        Raises `InputError` where periods, detectors and vehicles do not go together.
+        Raises `InputError` where periods, detectors and vehicles do not go together, or nothing can be drawn.
         """
         self.scenario, self.site_model = scenario, site_model
-        self.world, self.plan = _built(scenario, site_model)
+        self._drawer = Drawer(scenario, site_model)
+        seed = scenario.mission.seed
+        self.draws = self._drawer.draw([seed])
+        self.world, self.plan = self._drawn(seed, {path: value for path, (value,) in self.draws.values.items()})
         self._batches: dict[int, Batch] = {}
         self.clock = Clock()
 
     def reset(self, seed: int) -> WorldState:
         """One mission's world at its start, to be stepped by hand with `swarmsim.step`: every vehicle is active."""
         return reset(self.world, jax.random.key(seed))
+
+    def draw(self, seeds: int | Sequence[int] | np.ndarray) -> Draws:
+        """What the missions ``seeds`` of a family draw; ``values`` of it can be changed and given to `rollout`."""
+        return self._drawer.draw(np.atleast_1d(np.asarray(seeds, np.int64)))
+
+    def world_of(self, seed: int) -> World:
+        """The world of the mission ``seed`` of a family, to be stepped by hand; of the shapes of ``world``."""
+        world, plan = self._drawn(seed, {path: value for path, (value,) in self.draw(seed).values.items()})
+        self._check_alike((world, plan), self.draws.values)
+        return world
+
+    def check_family(self) -> None:
+        """Build the mission at the ends of every distribution, one at a time; raises `InputError` where that fails."""
+        own = {path: value for path, (value,) in self.draws.values.items()}
+        first = {varied.key: varied for varied in reversed(self.scenario.family)}
+        problems: list[Problem] = []
+        for key, varied in first.items():
+            for value in ends_of(varied):
+                try:
+                    built = _built(with_values(self.scenario, own | {varied.path: value}), self.site_model)
+                    self._check_alike(built, [key])
+                except InputError as error:
+                    told, place = error.problems[0], ("vary", key, varied.distribution.kind)
+                    hints = {"allowed": told.allowed or CAN_VARY, "suggestion": told.suggestion}
+                    message = f"draws a value with which the mission is wrong: {told.message}"
+                    problems.append(self.scenario.problem(place, message, given=str(value), **hints))
+                    break
+        raise_if_any(problems)
 
     def rollout(
         self,
@@ -96,7 +131,8 @@ class Simulation:
 
         Args:
             seeds: a number, or a sequence of B.
-            values: for each path of the scenario (``"sources.0.activity_mbq"``) a value for each of the B missions.
+            values: for each path of the scenario (``"sources.0.activity_mbq"``) a value for each of the B missions,
+                in the stead of what a family draws there.
             progress: is told how far the missions are.
 
         Raises:
@@ -108,7 +144,8 @@ class Simulation:
         batch = self._batches.setdefault(len(padded), Batch(len(padded), self.clock))
         self.clock.reset()
         layout = layout_for(self.world.vehicles * batch.missions // batch.shards)
-        worlds, plans = self._spread(batch, values or {}, len(numbers), layout)
+        draws = self._given(self.draw(numbers), values or {})
+        worlds, plans = self._spread(batch, draws, layout)
         run = _Run(batch, worlds, plans, self.plan, tell)
         keys = batch.put(randomness.mission_keys(padded))
         end, segments = run.fly(keys)
@@ -120,32 +157,54 @@ class Simulation:
             segments=tuple(segments),
             conclusion=run.conclude(end, keys),
             clock=self.clock.copy(),
+            draws=draws,
         )
 
-    def _spread(
-        self, batch: Batch, values: Mapping[str, Sequence[Any]], missions: int, layout: Layout
-    ) -> tuple[Spread, Spread]:
-        """World and plan of every mission."""
-        if not values:
-            return batch.spread([replace(self.world, layout=layout)]), batch.spread([self.plan])
+    def _given(self, draws: Draws, values: Mapping[str, Sequence[Any]]) -> Draws:
+        """The draws with ``values`` in their stead."""
+        missions = len(draws.seeds)
         for path, each in values.items():
             if len(each) != missions:
                 raise InputError.of(
                     "needs a value for each mission", path=path, given=f"{len(each)} values", allowed=str(missions)
                 )
+        scenario = self.scenario
+        named = {canonical(scenario.document, path, scenario.mission_file): each for path, each in values.items()}
+        return with_given(draws, named)
+
+    def _drawn(self, seed: int, row: Mapping[str, Any]) -> tuple[World, Plan]:
+        """World and plan of a mission with these values; raises `InputError`, which tells the seed, for wrong ones."""
+        scenario = self.scenario
+        if not row:
+            return _built(scenario, self.site_model)
+        try:
+            scenario = with_values(scenario, row)
+            if self.scenario.family:
+                raise_if_any(check_site(scenario, self.site_model))
+            return _built(scenario, self.site_model)
+        except InputError as error:
+            if not self.scenario.family:
+                raise
+            drawn = [replace(p, message=f"{p.message} (in the mission of seed {seed})") for p in error.problems]
+            raise InputError(drawn) from None
+
+    def _spread(self, batch: Batch, draws: Draws, layout: Layout) -> tuple[Spread, Spread]:
+        """World and plan of every mission."""
+        values = draws.values
+        if not values:
+            return batch.spread([replace(self.world, layout=layout)]), batch.spread([self.plan])
         built: dict[tuple[Any, ...], tuple[World, Plan]] = {}
         pairs = []
-        for row in zip(*values.values(), strict=True):
+        for seed, row in zip(draws.seeds, zip(*values.values(), strict=True), strict=True):
             key = tuple(map(repr, row))
             if key not in built:
-                scenario = with_values(self.scenario, dict(zip(values, row, strict=True)))
-                built[key] = _built(scenario, self.site_model)
+                built[key] = self._drawn(seed, dict(zip(values, row, strict=True)))
                 self._check_alike(built[key], values)
             pairs.append(built[key])
         worlds = [replace(world, layout=layout) for world, _ in pairs]
         return batch.spread(worlds), batch.spread([plan for _, plan in pairs])
 
-    def _check_alike(self, built: tuple[World, Plan], values: Mapping[str, Any]) -> None:
+    def _check_alike(self, built: tuple[World, Plan], values: Iterable[str]) -> None:
         """Refuse what would need another program: other sizes, or other static choices."""
         for own, other in zip((self.world, self.plan), built, strict=True):
             leaves, structure = jax.tree.flatten(own)

@@ -15,6 +15,7 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.flight import Failsafe
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
+from swarmsim.kept import kept
 from swarmsim.physics.multirotor import check_time_step
 from swarmsim.pytree import on_host
 from swarmsim.radiation.background import SMOOTH_M, BackgroundField
@@ -300,7 +301,11 @@ def _counter(scenario: Scenario, specs: Sequence[Spec], timing: Timing, library:
 
 def _detector(scenario: Scenario, model: str, library: Library) -> Detector:
     mount = next(s.detector for s in scenario.vehicles if s.detector is not None and s.detector.model == model)
-    return build_detector(scenario.detectors[model], mount, library, scenario.mission.detection)
+    return _kept_detector(scenario.detectors[model], mount, library, scenario.mission.detection)
+
+
+_kept_detector = kept(8)(build_detector)
+"""Its tables take a second: missions of a family share them."""
 
 
 def _exposure_ticks(scenario: Scenario, model: str, timing: Timing) -> int:

@@ -51,10 +51,12 @@ def test_a_shipped_mission_resolves_fits_its_site_and_is_read_back(name: str, tm
     assert again.to_yaml() == scenario.to_yaml()
 
 
-def test_the_paper_mission_differs_in_the_detector_only() -> None:
+def test_the_paper_mission_differs_in_the_detector_and_its_flat_background_only() -> None:
     physical, paper = load_scenario("recon").mission, load_scenario("recon_paper").mission
     assert paper.detection == "paper_ideal"
-    assert paper == physical.model_copy(update={"name": "recon_paper", "detection": "paper_ideal"})
+    assert paper.background == physical.background.model_copy(update={"ground_share": 0.0})
+    changes = {"name": "recon_paper", "detection": "paper_ideal", "background": paper.background}
+    assert paper == physical.model_copy(update=changes)
 
 
 def test_the_mixed_mission_has_three_types_of_uav_and_overlapping_phases() -> None:
