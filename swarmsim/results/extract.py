@@ -8,6 +8,7 @@ import numpy as np
 
 from swarmsim.estimation import SourceFit
 from swarmsim.missions.state import MissionState
+from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.results.record import (
     Estimate,
     Event,
@@ -26,6 +27,10 @@ from swarmsim.world.model import World
 
 NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"
+UNNAMED = {NONE: "none", UNKNOWN: "unknown"}
+"""What a spectrum is said to show where no nuclide is named."""
+BAD_FIT = 1e-3
+"""p-value below which the finding says that the named nuclide does not fit the spectrum."""
 SAMPLE = ("time_s", "position_m", "counts", "exposure_s")
 """Columns that samples have in common with readings."""
 CROWDED = "more vehicles were in one place than the neighbour search holds: a collision may have gone unnoticed"
@@ -237,8 +242,10 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         background=np.asarray(detector.background_spectrum) * live,
         fit=answer.fit,
         live_time_s=live,
-        nuclide=names[index] if index >= 0 else "none",
+        nuclide=names[index] if index >= 0 else UNNAMED[index],
         confidence=float(answer.confidence),
+        unknown=float(answer.unknown),
+        goodness=float(answer.goodness),
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
         lines_kev=np.array([line.energy_kev for line in lines]),
     )
@@ -298,8 +305,18 @@ def _finding(sought: bool, estimate: Estimate | None, spectrum: Spectrum | None,
         return f"{place}; nuclide presumed, no drivable way for the rover to reach it"
     if spectrum is None:
         return f"{place}; nuclide presumed, no spectrum was taken near it"
+    return f"{place}; {_identified(estimate, spectrum)}"
+
+
+def _identified(estimate: Estimate, spectrum: Spectrum) -> str:
+    """What the spectrum says of the nuclide under which the source was estimated."""
     if spectrum.nuclide == "none":
-        return f"{place}; nuclide presumed, the spectrum shows none"
+        return "nuclide presumed, the spectrum shows none"
+    if spectrum.nuclide == "unknown":
+        return f"nuclide presumed, the spectrum is of none in the library with {spectrum.confidence:.0%}"
+    said = f"identified with {spectrum.confidence:.1%}"
     if spectrum.nuclide != estimate.nuclide:
-        return f"{place}; nuclide presumed, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
-    return f"{place}; identified with {spectrum.confidence:.1%}"
+        said = f"nuclide presumed, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
+    if spectrum.goodness < BAD_FIT:
+        said += f", but fits the spectrum badly (p = {spectrum.goodness:.1g})"
+    return said
