@@ -3,12 +3,13 @@
     python -m experiments.validation.identification [--detectors NAME …] [--per-nuclide N] [--out FOLDER]
 
 Every nuclide of the library, bare and behind 0 to 4 mean free paths of concrete, steel or lead, at a net rate of half
-the background, with the gain (3 %), the resolution (15 %) and the background's amplitude (20 %) and tilt (10 %) drawn at
-random. Writes ``identification.csv`` (one row for each nuclide and condition) and, for each detector,
+the background, with the gain (3 %), the resolution (15 %) and the background's amplitude (20 %) and tilt (10 %) drawn
+at random. Writes ``identification.csv`` (one row for each nuclide and condition) and, for each detector,
 ``confusion_<detector>.png`` and ``calibration_<detector>.csv``.
 """
 
 import csv
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -96,7 +97,7 @@ def calibration(instrument: Instrument, n: int, rng: np.random.Generator) -> lis
     found = identified(instrument.detector, cases)
     confidence, right = np.asarray(found.confidence), np.asarray(found.nuclide) == truth
     rows = []
-    for low, high in zip(CLASSES[:-1], CLASSES[1:], strict=True):
+    for low, high in itertools.pairwise(CLASSES):
         of = (confidence > low) & (confidence <= high)
         rows.append(
             {

@@ -8,7 +8,7 @@ All nuclides are fitted alone, the best of them at all resolutions; each other i
 the best pair.
 Posterior = likelihood x Occam factor of each source's strength x prior, where each bin's deviance is reduced to account
 for the error of the templates. Free lines fit better than the truth does, by about a chi-squared number whose degrees
-of freedom are the lines that the resolution separates; they are charged for it.
+of freedom grow with the lines that the resolution separates; they are charged for it.
 """
 
 import math
@@ -27,11 +27,11 @@ from swarmsim.radiation.templates import Templates, rebinned, templates, widened
 
 NONE, UNKNOWN = -1, -2
 """What `Identification.nuclide` is where no nuclide is named: background only, or a source not in the library."""
-GAINS = (0.97, 0.98, 0.99, 1.0, 1.01, 1.02, 1.03)
+GAINS = tuple(0.97 + 0.005 * step for step in range(13))
 WIDTHS = (0.87, 1.0, 1.13)
-_NOMINAL = (GAINS.index(1.0), WIDTHS.index(1.0))
-_FREE_GAINS = (1, 3, 5)  # of GAINS, at which free lines are fitted: their energies are free anyway
-CANDIDATES = 6  # best single nuclides, which are fitted at other resolutions
+_COARSE = 2  # every so many gains all nuclides are fitted, the best ones then at the gains between
+_FREE_GAINS = (2, 6, 10)  # of GAINS, at which free lines are fitted: their energies are free anyway
+CANDIDATES = 5  # best single nuclides, which are fitted at other gains and resolutions
 REFINED = 4  # best mixtures, which are fitted to the end
 FIRSTS = 2  # best single nuclides to which each other is added
 _ITERATIONS = (40, 120)  # of the fits that find the best hypotheses, of the final fits
@@ -41,8 +41,12 @@ _PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.1, 0.
 _TEMPLATE_ERROR = 0.04  # relative error of the templates in a bin: an estimate
 _STRENGTH_SCALE = 0.3  # scale of the half-Cauchy prior of a source's strength, in units of the background
 _COUNTS_FLOOR = 0.05  # per bin: keeps the information finite where almost no counts are expected
-_FREE_SHARE = 0.45  # parameters that free lines add, over their number on the grid: measured over random spectra
-_FREE_SIGMAS = 2.6  # by so many standard deviations of its null distribution must the gain of free lines be too large
+_FREE = ((10, 29.0), (120, 55.0))
+"""Iterations of a fit of free lines, and by how much its deviance is smaller than that of the true nuclide: mean over
+random spectra of the library on a grid of `_FREE_GRID` lines. Few iterations fit the noise less, and more are needed
+where there are many counts."""
+_FREE_GRID = 110
+_FREE_SIGMAS = 1.6  # by so many standard deviations (chi-squared) must it be smaller than that
 _NATURAL = 2  # templates of the background, which come first
 
 
@@ -180,21 +184,25 @@ def _background_only(binned: _Binned, data: _Data) -> _Fits:
 
 
 def _singles(binned: _Binned, data: _Data) -> _Fits:
-    """Fits of each nuclide alone: at every gain, and the best of them at every width too."""
+    """Fits of each nuclide alone: all at every `_COARSE`-th gain, the best at those between and at every width."""
     gains, _, n, _, bins = binned.nuclides.shape
-    nominal = WIDTHS.index(1.0)
-    natural = jnp.broadcast_to(binned.background[:, nominal, None], (gains, n, _NATURAL, bins))
-    shape = jnp.concatenate([natural, binned.nuclides[:, nominal]], axis=2)
+    nominal, coarse_gains = WIDTHS.index(1.0), np.arange(0, gains, _COARSE)
+    natural = binned.background[coarse_gains, nominal, None]
+    natural = jnp.broadcast_to(natural, (len(coarse_gains), n, _NATURAL, bins))
+    shape = jnp.concatenate([natural, binned.nuclides[coarse_gains, nominal]], axis=2)
     weights = _maximise(shape, data, _ITERATIONS[0])
-    loss = _loss(shape, weights, data)
-    gain, number = jnp.argmin(loss, axis=0), jnp.arange(n)
-    coarse = _fits(binned, data, weights[gain, number], number[:, None], gain, jnp.full(n, nominal))
+    row, number = jnp.argmin(_loss(shape, weights, data), axis=0), jnp.arange(n)
+    gain = _COARSE * row
+    coarse = _fits(binned, data, weights[row, number], number[:, None], gain, jnp.full(n, nominal))
     top = jax.lax.top_k(coarse.score, min(CANDIDATES, n))[1]
-    tried = jnp.arange(len(WIDTHS))
-    pairs = [jnp.repeat(top, len(tried)), jnp.repeat(gain[top], len(tried)), jnp.tile(tried, len(top))]
-    shape = _shapes(binned, pairs[0][:, None], pairs[1], pairs[2])
-    finer = _fits(binned, data, _maximise(shape, data, _ITERATIONS[1]), pairs[0][:, None], pairs[1], pairs[2])
-    best = jnp.argmax(finer.score.reshape(len(top), len(tried)), axis=1) + jnp.arange(len(top)) * len(tried)
+    moves, widths = (
+        jnp.ravel(axis) for axis in jnp.meshgrid(jnp.arange(1 - _COARSE, _COARSE), jnp.arange(len(WIDTHS)))
+    )
+    tried = jnp.repeat(top, len(moves))
+    gain, width = jnp.clip(gain[tried] + jnp.tile(moves, len(top)), 0, gains - 1), jnp.tile(widths, len(top))
+    weights = _maximise(_shapes(binned, tried[:, None], gain, width), data, _ITERATIONS[1])
+    finer = _fits(binned, data, weights, tried[:, None], gain, width)
+    best = jnp.argmax(finer.score.reshape(len(top), len(moves)), axis=1) + jnp.arange(len(top)) * len(moves)
     return jax.tree.map(lambda all_of, some: all_of.at[top].set(some), coarse, finer.at(best))
 
 
@@ -225,13 +233,16 @@ def _free_lines(binned: _Binned, data: _Data) -> jax.Array:
     """Score [] of a source of any energies: free lines of the detector's own shape."""
     natural = binned.background[np.array(_FREE_GAINS), WIDTHS.index(1.0)]
     shape = jnp.concatenate([natural, binned.lines], axis=1)
-    weights = _maximise(shape, data, _ITERATIONS[1])
-    loss = _loss(shape, weights, data)
-    best = jnp.argmin(loss)
-    freedom = _FREE_SHARE * binned.lines.shape[1]
-    charge = freedom + _FREE_SIGMAS * math.sqrt(2.0 * freedom)
-    occam = _log_occam(shape[best, None, _NATURAL:], weights[best, None, _NATURAL:], data, weights[best] @ shape[best])
-    return occam[0] - 0.5 * (loss[best] + charge)
+    scores = []
+    for iterations, mean in _FREE:
+        weights = _maximise(shape, data, iterations)
+        loss = _loss(shape, weights, data)
+        best = jnp.argmin(loss)
+        sources = weights[best, None, _NATURAL:]
+        occam = _log_occam(shape[best, None, _NATURAL:], sources, data, weights[best] @ shape[best])[0]
+        freedom = mean * binned.lines.shape[1] / _FREE_GRID
+        scores.append(occam - 0.5 * (loss[best] + freedom + _FREE_SIGMAS * math.sqrt(2.0 * freedom)))
+    return jnp.max(jnp.stack(scores))
 
 
 def _shapes(binned: _Binned, nuclide: jax.Array, gain: jax.Array, width: jax.Array) -> jax.Array:
