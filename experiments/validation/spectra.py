@@ -1,6 +1,7 @@
 """Spectra of shielded nuclides as a detector whose gain, resolution and background have drifted would count them."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -106,7 +107,9 @@ def without(detector: Detector, nuclide: int) -> Detector:
 
     As `restrict`, but lines keep their padding and the names are those of the first ones, whatever is left out.
     """
-    tables = ("yields", "effective_area_m2", "near_share", "attenuation_1_m", "scatter_1_m", "peak_spectrum")
-    tables += ("scattered_bins", "line_energy_kev")
-    left = {name: jnp.delete(getattr(detector, name), nuclide, axis=0) for name in tables}
+    tables = [
+        *("yields", "effective_area_m2", "near_share", "attenuation_1_m"),
+        *("scatter_1_m", "peak_spectrum", "scattered_bins", "line_energy_kev"),
+    ]
+    left: dict[str, Any] = {name: jnp.delete(getattr(detector, name), nuclide, axis=0) for name in tables}
     return replace(detector, nuclide_names=detector.nuclide_names[:-1], **left)

@@ -40,7 +40,8 @@ def _moments() -> tuple[np.ndarray, np.ndarray]:
     chance = np.exp(host_xlogy(_COUNTS, mean) - mean - gammaln(_COUNTS + 1.0))
     loss = 2.0 * (mean - _COUNTS + host_xlogy(_COUNTS, _COUNTS / mean))
     first = np.sum(chance * loss, axis=1)
-    return np.float32(first), np.float32(np.sum(chance * (loss - first[:, None]) ** 2, axis=1))
+    spread = np.sum(chance * (loss - first[:, None]) ** 2, axis=1)
+    return first.astype(np.float32), spread.astype(np.float32)
 
 
 _MOMENTS = _moments()

@@ -46,7 +46,7 @@ _FREE = ((10, 29.0), (120, 55.0))
 random spectra of the library on a grid of `_FREE_GRID` lines. Few iterations fit the noise less, and more are needed
 where there are many counts."""
 _FREE_GRID = 110
-_FREE_SIGMAS = 1.6  # by so many standard deviations (chi-squared) must it be smaller than that
+_FREE_SIGMAS = 1.8  # by so many standard deviations (chi-squared) must it be smaller than that
 _NATURAL = 2  # templates of the background, which come first
 
 
@@ -117,11 +117,11 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
             best = before.at(jax.lax.top_k(before.score, min(firsts, n))[1])
             groups.append((_with_another(binned, data, best, count), prior, math.comb(n, count)))
     library = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(fits for fits, _, _ in groups))
-    prior = np.concatenate([np.full(len(fits.score), math.log(p / number)) for fits, p, number in groups])
+    priors = np.concatenate([np.full(len(fits.score), math.log(p / number)) for fits, p, number in groups])
     free = _free_lines(binned, data) + math.log(_PRIOR_UNKNOWN)
-    chance = jax.nn.softmax(jnp.append(library.score + prior, free))
+    chance = jax.nn.softmax(jnp.append(library.score + priors, free))
     present, none, unknown = chance[:-1] @ library.members, chance[0], chance[-1]
-    best = library.at(jnp.argmax(library.score + prior))
+    best = library.at(jnp.argmax(library.score + priors))
     strength = jnp.sum(library.weights, axis=2)
     share = strength / jnp.maximum(jnp.sum(strength, axis=1, keepdims=True), 1e-9)
     main = jnp.argmax(chance[:-1] @ (share * library.members))

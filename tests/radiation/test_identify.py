@@ -153,7 +153,7 @@ def test_a_stranger_is_unknown(library: Library) -> None:
 def test_three_nuclides_are_named(detectors: Detectors) -> None:
     detector = detectors["nai_2x2", "physical"]
     names = ("Am-241", "Co-60", "Cs-137")
-    found = draws(detector, sum(spectrum(detector, n, 100.0) for n in names), 6, seed=7)
+    found = draws(detector, jnp.sum(jnp.stack([spectrum(detector, n, 100.0) for n in names]), axis=0), 6, seed=7)
     chosen = [detector.nuclide_names.index(n) for n in names]
     assert np.all(np.asarray(found.posterior)[:, chosen] > 0.9)
     assert np.all(np.delete(np.asarray(found.posterior), chosen, axis=1) < 0.1)
@@ -188,7 +188,8 @@ def test_thickness_gives_its_optical_depth(detectors: Detectors) -> None:
     detector = detectors["nai_2x2", "physical"]
     lead, caesium = detector.material_names.index("lead"), detector.nuclide_names.index("Cs-137")
     attenuation = float(detector.attenuation_1_m[caesium, 0, lead])
-    assert float(thickness_m(detector, caesium, lead, 2.0)) == pytest.approx(2.0 / attenuation, rel=1e-4)
+    found = thickness_m(detector, jnp.int32(caesium), jnp.int32(lead), jnp.float32(2.0))
+    assert float(found) == pytest.approx(2.0 / attenuation, rel=1e-4)
 
 
 def test_a_counter_without_energy_resolution_is_refused(library: Library) -> None:
