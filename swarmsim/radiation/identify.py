@@ -39,6 +39,7 @@ _RELAXATION = 1.6  # exponent of the multiplicative step; below 2 it still conve
 # Prior: a hotspot may be natural background, may be no nuclide of the library, and is rarely a mixture.
 _PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.1, 0.4, 0.08, 0.02
 _TEMPLATE_ERROR = 0.04  # relative error of the templates in a bin: an estimate
+_SHAPE_ERROR = 0.06  # relative error of a nuclide's whole shape, which free lines do not have: an estimate
 _STRENGTH_SCALE = 0.3  # scale of the half-Cauchy prior of a source's strength, in units of the background
 _COUNTS_FLOOR = 0.05  # per bin: keeps the information finite where almost no counts are expected
 _FREE = ((10, 29.0), (120, 55.0))
@@ -46,7 +47,7 @@ _FREE = ((10, 29.0), (120, 55.0))
 random spectra of the library on a grid of `_FREE_GRID` lines. Few iterations fit the noise less, and more are needed
 where there are many counts."""
 _FREE_GRID = 110
-_FREE_SIGMAS = 1.8  # by so many standard deviations (chi-squared) must it be smaller than that
+_FREE_SIGMAS = 1.5  # by so many standard deviations (chi-squared) must it be smaller than that
 _NATURAL = 2  # templates of the background, which come first
 
 
@@ -241,7 +242,8 @@ def _free_lines(binned: _Binned, data: _Data) -> jax.Array:
         sources = weights[best, None, _NATURAL:]
         occam = _log_occam(shape[best, None, _NATURAL:], sources, data, weights[best] @ shape[best])[0]
         freedom = mean * binned.lines.shape[1] / _FREE_GRID
-        scores.append(occam - 0.5 * (loss[best] + freedom + _FREE_SIGMAS * math.sqrt(2.0 * freedom)))
+        charge = freedom + _FREE_SIGMAS * math.sqrt(2.0 * freedom) + _SHAPE_ERROR**2 * jnp.sum(sources)
+        scores.append(occam - 0.5 * (loss[best] + charge))
     return jnp.max(jnp.stack(scores))
 
 
