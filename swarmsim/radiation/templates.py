@@ -12,13 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.radiation.cylinder import direction_basis
-from swarmsim.radiation.detector import Detector
+from swarmsim.radiation.detector import AIR, Detector
 from swarmsim.radiation.rate import scattered_shares, transmission
 from swarmsim.site.rays import Crossed
 
 SHIELDS = ("concrete", "steel", "lead")
 DEPTHS = (1.3, 3.6)
 """Optical depths of the shields of the templates; sums of them and of the bare spectrum cover 0 to 4."""
+AIR_DEPTH = 0.5
+"""Optical depth of the air of a template: metres of it scatter a tenth of the photons of 60 keV."""
 TILT = 0.2
 """Relative change of the background's shape at both ends of the energies in its two templates."""
 _TILT_KEV = (30.0, 3000.0)
@@ -37,7 +39,9 @@ def templates(detector: Detector) -> Templates:
     """Templates of every nuclide of a detector with energy resolution."""
     names = detector.material_names
     walls = [names.index(name) for name in SHIELDS if name in names] or [0]
-    amounts = jnp.asarray([(wall, depth) for wall in walls for depth in DEPTHS], jnp.float32)
+    layers = [(wall, depth) for wall in walls for depth in DEPTHS]
+    layers += [(names.index(AIR), AIR_DEPTH)] if AIR in names else []
+    amounts = jnp.asarray(layers, jnp.float32)
 
     def of_nuclide(number: jax.Array) -> jax.Array:
         bare = shielded(detector, number, jnp.zeros(len(names)))
