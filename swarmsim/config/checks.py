@@ -232,3 +232,8 @@ def _check_estimates(scenario: Scenario) -> Iterator[Problem]:
     if mission.identification is not None and mission.localisation is None:
         message = "spectra are taken round the estimated source, and the mission has no localisation"
         yield scenario.problem(("identification",), message, suggestion="add localisation, or leave identification out")
+    resolve = [detector.spectrometer is not None for detector in scenario.detectors.values()]
+    if mission.identification is not None and resolve and not any(resolve):
+        message = "nuclides cannot be told apart: no detector of the team resolves energies"
+        suggestion = "give a vehicle type a scintillator, or leave identification out"
+        yield scenario.problem(("identification",), message, given=", ".join(scenario.detectors), suggestion=suggestion)

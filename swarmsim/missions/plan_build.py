@@ -108,8 +108,12 @@ def _windows(scenario: Scenario, world: World) -> tuple[tuple[int, ...], tuple[i
 
 
 def _spectrometer(world: World) -> int:
-    """Detector model whose spectra are identified: that of a rover, which comes near; else the first."""
-    models = [(KINDS[g.kind].FLIES, g.counter.index) for g in world.groups if g.counter is not None]
+    """Detector model whose spectra are identified: of those with energy resolution a rover's, else the first."""
+    models = [
+        (KINDS[g.kind].FLIES, g.counter.index)
+        for g in world.groups
+        if g.counter is not None and g.counter.detector.identification_bins
+    ]
     return min(models)[1] if models else -1
 
 

@@ -48,7 +48,8 @@ def spectrum_title(spectrum: Spectrum) -> str:
     if spectrum.nuclide == "none":
         return "no nuclide named"
     confidence = "> 0.999" if spectrum.confidence > 0.999 else f"{spectrum.confidence:.3f}"
-    return f"{spectrum.nuclide}, confidence {confidence}"
+    named = "not in the library" if spectrum.nuclide == "unknown" else spectrum.nuclide
+    return f"{named}, confidence {confidence}"
 
 
 def _merged(values: NDArray[np.floating], merge: int) -> NDArray[np.floating]:

@@ -45,8 +45,8 @@ def background_factor(
     height = place_m[2] - sample(site.terrain_m, site, place_m[:2])
     fall = jnp.exp(-AIR_1_M * (jnp.maximum(height, 0.0) - reference_m))
     near = jnp.clip(1.0 - height / SMOOTH_M, 0.0, 1.0)
-    below = sample(field.surface, site, place_m[:2])
-    surface = near * below + (1.0 - near) * sample(field.around, site, place_m[:2])
+    below = sample(jnp.asarray(field.surface), site, place_m[:2])
+    surface = near * below + (1.0 - near) * sample(jnp.asarray(field.around), site, place_m[:2])
     across = (place_m[:2] @ field.step_normal - field.step_offset_m) / jnp.maximum(field.step_width_m, 1e-3)
     step = 1.0 + field.step_share * jax.nn.sigmoid(4.0 * across)
     ground = surface * step * _patches(field, key, place_m[:2]) * fall

@@ -14,9 +14,17 @@ from swarmsim.config.radiation import DetectorMount
 from swarmsim.pytree import on_device, pytree, static
 from swarmsim.radiation import scattering
 from swarmsim.radiation.attenuation import linear_attenuation
+from swarmsim.radiation.crystal import ENERGIES_KEV
 from swarmsim.radiation.cylinder import NEAR_TABLES, fit_effective_area, near_tables
 from swarmsim.radiation.library import Library
-from swarmsim.radiation.response import Response, background_spectrum, build_response, line_spectra, normalised
+from swarmsim.radiation.response import (
+    SIGMA_PER_FWHM,
+    Response,
+    background_spectrum,
+    build_response,
+    line_spectra,
+    normalised,
+)
 
 Floats = NDArray[np.float64]
 
@@ -63,8 +71,10 @@ class Detector:
     peak_rois: jax.Array  # [N, L, R] the spectra above added up in the regions of interest
     scattered_rois: jax.Array  # [N, depths, M, L, R] share of the scattered counts in each
     background_rois: jax.Array  # [R] cps, sums to background_cps
+    grid_spectrum: jax.Array  # [grid, channels] spectra of lines half a resolution (FWHM) apart, each sums to 1
     background_spectrum: jax.Array  # [channels] cps, sums to background_cps
     energy_kev: jax.Array  # [channels] centre of each channel
+    sigma_kev: jax.Array  # [channels] standard deviation of a peak there
     line_energy_kev: jax.Array  # [N, L]
     nuclide_names: tuple[str, ...] = static()
     material_names: tuple[str, ...] = static()
@@ -250,8 +260,10 @@ def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins
             "peak_rois": f32(np.ones((*energy.shape, 1))),
             "scattered_rois": f32(np.ones((*bins.shape[:-1], 1))),
             "background_rois": f32(np.array([spec.background.rate_cps])),
+            "grid_spectrum": f32(np.ones((1, 1))),
             "background_spectrum": f32(np.array([spec.background.rate_cps])),
             "energy_kev": f32(np.array([662.0])),
+            "sigma_kev": f32(np.array([662.0])),
             "identification_bins": (),
         }
     assert spec.spectrometer is not None
@@ -264,11 +276,13 @@ def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins
     return {
         "peak_spectrum": f32(peaks[back].reshape(*energy.shape, -1)),
         "bin_spectrum": f32(of_bins),
+        "grid_spectrum": f32(normalised(line_spectra(response, _line_grid(response)))),
         "peak_rois": f32((peaks @ rois)[back].reshape(*energy.shape, -1)),
         "scattered_rois": f32(bins @ of_bins @ rois),
         "background_rois": f32(background @ rois),
         "background_spectrum": f32(background),
         "energy_kev": f32(response.channel_centre_kev),
+        "sigma_kev": f32(response.sigma_kev(response.channel_centre_kev)),
         "identification_bins": _identification_bins(response),
     }
 
@@ -279,12 +293,20 @@ def _rois(response: Response, edges_kev: tuple[float, ...]) -> Floats:
     return np.eye(len(edges_kev) - 1)[number]
 
 
+def _line_grid(response: Response) -> Floats:
+    """Energies half a resolution (FWHM) apart, from the threshold to the end of the response and the channels."""
+    low, high = response.threshold_kev, min(response.channel_edge_kev[-1], ENERGIES_KEV[-1])
+    # FWHM grows as the root of the energy, so that the roots of the energies lie at equal distances
+    step = 0.25 * float(response.sigma_kev(np.asarray(low))) / SIGMA_PER_FWHM / np.sqrt(low)
+    return np.linspace(np.sqrt(low), np.sqrt(high), round((np.sqrt(high) - np.sqrt(low)) / step) + 1) ** 2
+
+
 def _identification_bins(response: Response) -> tuple[int, ...]:
     """First channels of bins a third of the resolution (FWHM) wide, from the threshold, and the end of the last bin."""
     starts = [int(np.searchsorted(response.channel_edge_kev, response.threshold_kev))]
     end = len(response.channel_centre_kev)
     while starts[-1] < end:
         energy = response.channel_edge_kev[starts[-1]]
-        fwhm = response.sigma_kev(np.asarray(energy)) * 2.354820045
+        fwhm = response.sigma_kev(np.asarray(energy)) / SIGMA_PER_FWHM
         starts.append(min(end, starts[-1] + max(1, round(float(fwhm) / 3 / response.channel_width_kev))))
     return tuple(starts)

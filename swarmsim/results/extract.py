@@ -8,6 +8,7 @@ import numpy as np
 
 from swarmsim.estimation import SourceFit
 from swarmsim.missions.state import MissionState
+from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.radiation.rate import highest_rate
 from swarmsim.results.record import (
     Estimate,
@@ -31,6 +32,10 @@ LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
 """Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
 NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"
+UNNAMED = {NONE: "none", UNKNOWN: "unknown"}
+"""What a spectrum is said to show where no nuclide is named."""
+BAD_FIT = 1e-3
+"""p-value below which the finding says that the named nuclide does not fit the spectrum."""
 SAMPLE = ("time_s", "position_m", "counts", "exposure_s")
 """Columns that samples have in common with readings."""
 CROWDED = "more vehicles were in one place than the neighbour search holds: a collision may have gone unnoticed"
@@ -250,8 +255,10 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         background=np.asarray(detector.background_spectrum) * live,
         fit=answer.fit,
         live_time_s=live,
-        nuclide=names[index] if index >= 0 else "none",
+        nuclide=names[index] if index >= 0 else UNNAMED[index],
         confidence=float(answer.confidence),
+        unknown=float(answer.unknown),
+        goodness=float(answer.goodness),
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
         lines_kev=np.array([line.energy_kev for line in lines]),
     )
@@ -356,8 +363,18 @@ def _found(estimate: Estimate | None, spectrum: Spectrum | None, no_way: bool) -
         return f"{place}; nuclide presumed, no drivable way for the rover to reach it"
     if spectrum is None:
         return f"{place}; nuclide presumed, no spectrum was taken near it"
+    return f"{place}; {_identified(estimate, spectrum)}"
+
+
+def _identified(estimate: Estimate, spectrum: Spectrum) -> str:
+    """What the spectrum says of the nuclide under which the source was estimated."""
     if spectrum.nuclide == "none":
-        return f"{place}; nuclide presumed, the spectrum shows none"
+        return "nuclide presumed, the spectrum shows none"
+    if spectrum.nuclide == "unknown":
+        return f"nuclide presumed, the spectrum is of none in the library with {spectrum.confidence:.0%}"
+    said = f"identified with {spectrum.confidence:.1%}"
     if spectrum.nuclide != estimate.nuclide:
-        return f"{place}; nuclide presumed, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
-    return f"{place}; identified with {spectrum.confidence:.1%}"
+        said = f"nuclide presumed, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
+    if spectrum.goodness < BAD_FIT:
+        said += f", but fits the spectrum badly (p = {spectrum.goodness:.1g})"
+    return said

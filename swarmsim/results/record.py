@@ -114,10 +114,12 @@ class Spectrum:
     background: Floats  # [c] expected background counts in the same live time
     fit: Floats  # [c] fitted counts of the best nuclide plus background
     live_time_s: float
-    nuclide: str  # "none" where no nuclide explains the counts
-    confidence: float
+    nuclide: str  # "none" where the background explains the counts, "unknown" where no nuclide of the library does
+    confidence: float  # of that answer
     scores: dict[str, float]  # posterior of every candidate nuclide
     lines_kev: Floats = field(default_factory=lambda: np.zeros(0))  # [l] gamma lines of the named nuclide, for labels
+    unknown: float = 0.0  # probability of a source that no nuclides of the library explain
+    goodness: float = 1.0  # p-value of the deviance of the fit
 
 
 @dataclass(frozen=True)

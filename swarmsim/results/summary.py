@@ -199,7 +199,7 @@ def energy_wh(vehicle: VehicleRecord) -> float:
 
 def named(spectrum: Spectrum | None) -> str | None:
     """The nuclide that a spectrum names, if it names one."""
-    return None if spectrum is None or spectrum.nuclide == "none" else spectrum.nuclide
+    return None if spectrum is None or spectrum.nuclide in ("none", "unknown") else spectrum.nuclide
 
 
 def _plain(values: NDArray[np.floating]) -> list[float]:

@@ -272,6 +272,17 @@ def test_a_team_that_cannot_measure_finds_nothing(mission: Path) -> None:
     assert "needs the hotspot, and no vehicle of the team carries a detector to find it" in message
 
 
+def test_a_team_that_resolves_no_energies_identifies_nothing(mission: Path) -> None:
+    for file in (mission.parents[1] / "vehicles").glob("*.yaml"):
+        data = read_file(file).data
+        if data.get("detector"):
+            data["detector"]["model"] = "geiger_sbm20"
+            file.write_text(dump_yaml(data))
+    message = message_of(mission, "description=counters")
+    assert "identification: nuclides cannot be told apart: no detector of the team resolves energies" in message
+    load_scenario(mission, ["identification="])
+
+
 def test_a_trigger_is_validated_in_python_too(mission: Path) -> None:
     made = load_model(mission, Mission)
     assert made.phases[0].who == ("uav1", "uav2", "uav3")

@@ -149,7 +149,8 @@ def test_hidden_places_see_less_of_the_horizon_than_open_ones(yard):
             if region in seen:
                 point = ground.above(np.array([draws.values[path][index]]), 1.0)[0]
                 seen[region].append(free_share(ground, point, 3.0))
-    assert max(seen["behind_walls"]) <= 0.93
+    assert np.mean(seen["behind_walls"]) <= 0.85
+    assert max(seen["behind_walls"]) < 1.0
     assert min(seen["open"]) == 1.0
 
 

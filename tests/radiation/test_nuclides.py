@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 
 from swarmsim.radiation import Library
-from swarmsim.radiation.library import mass_attenuation
+from swarmsim.radiation.attenuation import mass_attenuation
 
 DAY_S, YEAR_S = 86400.0, 3.15576e7
 

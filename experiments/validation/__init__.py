@@ -1,0 +1,1 @@
+"""What the models and estimators promise, measured over random cases."""

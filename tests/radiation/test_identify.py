@@ -1,0 +1,199 @@
+"""Identification of nuclides, mixtures and strangers in spectra."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import kstest
+
+from swarmsim.config.errors import InputError
+from swarmsim.config.load import load_named
+from swarmsim.radiation import Detector, Identification, Library, build_detector, identify, spectrum_rate
+from swarmsim.radiation.goodness import p_value
+from swarmsim.radiation.identify import NONE, UNKNOWN
+from swarmsim.radiation.templates import rebinned, thickness_m, widened
+from tests.radiation.points import MOUNT, point, through
+
+UP, PLACE = jnp.array([0.0, 0.0, 1.0]), jnp.array([0.0, 0.0, 5.0])
+LIVE_S = 60.0
+Detectors = dict[tuple[str, str], Detector]
+BATCH = 30
+_run = jax.jit(jax.vmap(identify, in_axes=(None, 0, None)))
+
+
+def spectrum(detector: Detector, nuclide: str, cps: float, **metres: float) -> jax.Array:
+    """Source spectrum [channels] scaled to ``cps``."""
+    channels = spectrum_rate(detector, point(detector, nuclide), through(detector, air=5.0, **metres), PLACE, UP)
+    return channels * cps / jnp.sum(channels)
+
+
+def draws(detector: Detector, mean_cps: jax.Array, n: int, live_s: float = LIVE_S, seed: int = 0) -> Identification:
+    """Identify ``n`` Poisson draws of a mean spectrum with the background on top."""
+    mean = (np.asarray(mean_cps) + np.asarray(detector.background_spectrum)) * live_s
+    return run(detector, np.random.default_rng(seed).poisson(mean, (n, len(mean))), live_s)
+
+
+def run(detector: Detector, counts: np.ndarray, live_s: float) -> Identification:
+    """Identify each row, in batches of one size so that it compiles once per kind."""
+    padded = np.zeros((-(-len(counts) // BATCH) * BATCH, counts.shape[1]), np.float32)
+    padded[: len(counts)] = counts
+    parts = [_run(detector, batch, live_s) for batch in padded.reshape(-1, BATCH, counts.shape[1])]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(counts)], *parts)
+
+
+@pytest.mark.parametrize("kind", ["physical", "paper_ideal"])
+@pytest.mark.parametrize("wall_m", [0.0, 0.1])
+def test_every_shipped_nuclide_is_identified(library: Library, detectors: Detectors, kind: str, wall_m: float) -> None:
+    """150 cps over 60 s, free and behind 10 cm of concrete."""
+    detector = detectors["nai_2x2", kind]
+    mean = np.stack([spectrum(detector, n, 150.0, concrete=wall_m) for n in library.nuclide_names])
+    counts = np.random.default_rng(2).poisson((mean + np.asarray(detector.background_spectrum)) * LIVE_S)
+    found = run(detector, counts, LIVE_S)
+    names = [library.nuclide_names[i] if i >= 0 else "none" for i in np.asarray(found.nuclide)]
+    assert names == list(library.nuclide_names)
+    assert np.all(np.asarray(found.confidence) > 0.6)
+    above = slice(detector.identification_bins[0], None)
+    np.testing.assert_allclose(np.sum(found.fit, axis=1), np.sum(counts[:, above], axis=1), rtol=0.02)
+
+
+def test_bare_background_has_no_nuclide(detectors: Detectors) -> None:
+    for kind in ("physical", "paper_ideal"):
+        for name in ("nai_1p5x1p5", "nai_2x2"):
+            found = draws(detectors[name, kind], jnp.zeros(1024), 30, seed=3)
+            assert np.mean(found.nuclide >= 0) <= 0.05
+            assert np.mean(found.none) > 0.8
+
+
+def test_confidence_grows_with_counts(detectors: Detectors) -> None:
+    detector = detectors["nai_2x2", "physical"]
+    co60 = detector.nuclide_names.index("Co-60")
+    found = [draws(detector, spectrum(detector, "Co-60", cps), 30) for cps in (0.3, 3.0, 8.0, 60.0)]
+    chance = [float(np.mean(f.posterior[:, co60])) for f in found]
+    assert chance[0] < 0.15
+    assert chance == sorted(chance)
+    assert chance[-1] > 0.98
+
+
+def test_no_data_is_the_prior(detectors: Detectors) -> None:
+    found = run(detectors["nai_2x2", "physical"], np.zeros((1, 1024)), 0.0)
+    assert found.nuclide[0] == NONE
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(found))
+    assert found.confidence[0] < 0.8
+
+
+def test_confidence_is_calibrated(detectors: Detectors) -> None:
+    """Of the nuclides named at confidence c, a share of c is right, over random nuclides, strengths, walls."""
+    detector = detectors["nai_2x2", "physical"]
+    rng = np.random.default_rng(11)
+    n = 240
+    nuclide = rng.integers(len(detector.nuclide_names), size=n)
+    strength = 50.0 * np.abs(np.tan(0.5 * np.pi * rng.random(n))).clip(0, 40)
+    walls = rng.choice([0.0, 0.03, 0.1], size=n)
+    present = rng.random(n) < 0.55
+    shapes = {
+        (i, w): np.asarray(spectrum(detector, name, 1.0, concrete=w))
+        for i, name in enumerate(detector.nuclide_names)
+        for w in (0.0, 0.03, 0.1)
+    }
+    mean = np.stack([p * s * shapes[i, w] for i, s, w, p in zip(nuclide, strength, walls, present, strict=True)])
+    mean = (mean + np.asarray(detector.background_spectrum)) * 20.0
+    found = run(detector, rng.poisson(mean), 20.0)
+    named = np.asarray(found.nuclide) >= 0
+    right = named & present & (np.asarray(found.nuclide) == nuclide)
+    confidence = np.asarray(found.confidence)
+    assert named.sum() > 60
+    for low, high in ((0.0, 0.8), (0.8, 0.98), (0.98, 1.01)):
+        chosen = named & (confidence >= low) & (confidence < high)
+        if chosen.sum() >= 5:
+            claimed, seen = confidence[chosen].mean(), right[chosen].mean()
+            assert seen > claimed - 3 * np.sqrt(max(claimed * (1 - claimed), 0.01) / chosen.sum())
+
+
+def test_a_mixture_names_both(detectors: Detectors) -> None:
+    detector = detectors["nai_2x2", "physical"]
+    both = spectrum(detector, "Co-60", 120.0) + spectrum(detector, "Cs-137", 60.0)
+    found = draws(detector, both, 6, seed=5)
+    co60, cs137 = (detector.nuclide_names.index(n) for n in ("Co-60", "Cs-137"))
+    assert np.all(np.asarray(found.posterior)[:, [co60, cs137]] > 0.9)
+    assert np.all(np.asarray(found.nuclide) == co60)
+    np.testing.assert_allclose(np.mean(found.strength_cps, axis=0)[[co60, cs137]], (120, 60), rtol=0.25)
+
+
+def drifted(detector: Detector, mean: np.ndarray, gain: float) -> np.ndarray:
+    """A mean spectrum [n, channels] after a change of gain."""
+    channel = np.arange(mean.shape[1] + 1)
+    below = np.pad(np.cumsum(mean, axis=1), ((0, 0), (1, 0)))
+    return np.stack([np.diff(np.interp(channel / gain, channel, row)) for row in below])
+
+
+@pytest.mark.parametrize("gain", [0.97, 1.03])
+def test_drift_of_the_gain_is_found(library: Library, detectors: Detectors, gain: float) -> None:
+    detector = detectors["nai_2x2", "physical"]
+    mean = np.stack([spectrum(detector, n, 80.0, concrete=0.03) for n in library.nuclide_names])
+    mean = drifted(detector, mean + np.asarray(detector.background_spectrum), gain)
+    found = run(detector, np.random.default_rng(4).poisson(mean * 40.0), 40.0)
+    assert np.mean(found.nuclide == np.arange(len(mean))) >= 0.96
+    assert np.median(found.gain) == pytest.approx(gain, abs=0.006)
+
+
+def test_a_stranger_is_unknown(library: Library) -> None:
+    """A nuclide that the tables lack: unknown at 1500 counts, and what the tables hold is not."""
+    strangers = ("Cs-137", "Zn-65", "Tc-99m", "F-18", "Bi-207")
+    spec = load_named("detectors", "nai_2x2")
+    whole = build_detector(spec, MOUNT, library, "physical")
+    known = tuple(n for n in library.nuclides if n.name not in strangers)
+    detector = build_detector(spec, MOUNT, Library(known, library.materials), "physical")
+    live = 1500.0 / (0.5 * 167.0)
+    for names, expected in ((strangers, [UNKNOWN] * 5), (detector.nuclide_names, list(range(len(known))))):
+        mean = np.stack([spectrum(whole, n, 83.5) for n in names]) + np.asarray(whole.background_spectrum)
+        found = run(detector, np.random.default_rng(6).poisson(mean * live), live)
+        assert list(found.nuclide) == expected
+        assert np.all(found.confidence > 0.5)
+
+
+def test_three_nuclides_are_named(detectors: Detectors) -> None:
+    detector = detectors["nai_2x2", "physical"]
+    names = ("Am-241", "Co-60", "Cs-137")
+    found = draws(detector, jnp.sum(jnp.stack([spectrum(detector, n, 100.0) for n in names]), axis=0), 6, seed=7)
+    chosen = [detector.nuclide_names.index(n) for n in names]
+    assert np.mean(np.all(np.asarray(found.posterior)[:, chosen] > 0.9, axis=1)) > 0.6
+    assert np.all(np.delete(np.asarray(found.posterior), chosen, axis=1) < 0.1)
+
+
+def test_goodness_is_a_p_value() -> None:
+    """Uniform over counts of the expectation, whether few or many are expected, and small for others."""
+    rng = np.random.default_rng(8)
+    for scale in (0.2, 3.0, 100.0):
+        expected = jnp.asarray(scale * rng.uniform(0.2, 2.0, 170), jnp.float32)
+        counts = rng.poisson(np.asarray(expected), (400, 170)).astype(np.float32)
+        values = jax.vmap(lambda row, e=expected: p_value(row, e, jnp.ones(170), 0.0))(counts)
+        assert kstest(np.asarray(values), "uniform").pvalue > 0.01
+    assert float(p_value(jnp.asarray(counts[0]), expected * 1.3, jnp.ones(170), 0.0)) < 1e-4
+
+
+def test_gain_moves_and_width_widens_peaks(detectors: Detectors) -> None:
+    """A Gaussian peak keeps its counts, moves with the gain, and has the variance of the new width."""
+    detector = detectors["nai_2x2", "physical"]
+    channel, edges = np.arange(1024), np.arange(1025)
+    sigma = float(detector.sigma_kev[341] / (detector.energy_kev[1] - detector.energy_kev[0]))
+    peak = jnp.asarray(np.exp(-0.5 * ((channel - 341) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)), jnp.float32)
+    for width in (0.87, 1.13):
+        wide = np.asarray(widened(detector, peak, jnp.float32(width)), np.float64)
+        assert wide.sum() == pytest.approx(1.0, abs=0.01)
+        assert np.sum(wide * (channel - 341.0) ** 2) == pytest.approx((width * sigma) ** 2, rel=0.05)
+    moved = np.asarray(rebinned(detector, peak, jnp.float32(1.03), edges), np.float64)
+    assert np.sum(moved * (channel + 0.5)) == pytest.approx(1.03 * 341.5, rel=1e-3)
+
+
+def test_thickness_gives_its_optical_depth(detectors: Detectors) -> None:
+    detector = detectors["nai_2x2", "physical"]
+    lead, caesium = detector.material_names.index("lead"), detector.nuclide_names.index("Cs-137")
+    attenuation = float(detector.attenuation_1_m[caesium, 0, lead])
+    found = thickness_m(detector, jnp.int32(caesium), jnp.int32(lead), jnp.float32(2.0))
+    assert float(found) == pytest.approx(2.0 / attenuation, rel=1e-4)
+
+
+def test_a_counter_without_energy_resolution_is_refused(library: Library) -> None:
+    detector = build_detector(load_named("detectors", "geiger_sbm20"), MOUNT, library, "physical")
+    with pytest.raises(InputError, match="energy resolution"):
+        identify(detector, jnp.ones(1), jnp.float32(1.0))
