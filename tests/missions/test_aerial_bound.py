@@ -12,7 +12,8 @@ import swarmsim
 from swarmsim.estimation import Measurements, cramer_rao_covariance, fisher_information
 from swarmsim.estimation.windows import gather, measured, windows_start
 from swarmsim.missions import knowledge
-from swarmsim.radiation import draw_counts, observed_rate
+from swarmsim.radiation import draw_counts, observed_rois
+from swarmsim.radiation.background import background_factor
 from swarmsim.randomness import mission_keys
 from swarmsim.sensors.radiation import source_rate
 
@@ -51,7 +52,11 @@ def survey():
     joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples)
     counter = world.groups[0].counter
     rate = jax.vmap(jax.vmap(lambda place, axis: source_rate(world.site, counter.detector, world.sources, place, axis)))
-    flat = jax.jit(lambda: observed_rate(counter.detector, rate(joined.position_m, joined.axis)))()
+    key, reference = jax.random.key(0), counter.detector.background_height_m
+    natural = jax.vmap(jax.vmap(lambda place: background_factor(world.background, world.site, key, place, reference)))
+    flat = jax.jit(
+        lambda: observed_rois(counter.detector, rate(joined.position_m, joined.axis), natural(joined.position_m))
+    )().sum(axis=-1)
     live_s = float(joined.exposure_s.max())
 
     def windows(key):
@@ -62,7 +67,7 @@ def survey():
             time_s=joined.time_s, position_m=joined.position_m, travel_m=joined.travel_m, axis=joined.axis,
             counts=counts, exposure_s=exposure, valid=joined.new, detector=jnp.zeros(counts.shape, jnp.int32),
         )  # fmt: skip
-        return measured(gather(windows_start(3, plan.windows[0]), drawn, joined.new, plan.per_window[0]), 0)
+        return measured(gather(windows_start(3, plan.windows[0], 1), drawn, joined.new, plan.per_window[0]), 0)
 
     def mission(key):
         found = knowledge.survey(plan, windows(key))
@@ -78,7 +83,8 @@ def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
     world, plan = simulation.world, simulation.plan
     source = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), world.sources)
     information = jax.jit(lambda: fisher_information(
-        world.site, plan.detectors, windows, source.position_m, source.activity_bq, source.nuclide, rays=6
+        world.site, plan.detectors, windows, source.position_m, source.activity_bq, source.nuclide, rays=6,
+        ground_share=plan.localisation.ground_share,
     ))()  # fmt: skip
     bound = np.sqrt(np.diag(cramer_rao_covariance(information, plan.localisation.height_std_m)))[:2]
     assert np.all((bound > 0.6) & (bound < 1.2))  # tens of centimetres from 20 m above: not a bound that says nothing
@@ -86,7 +92,7 @@ def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
     rmse = np.sqrt(np.mean(error**2, axis=0))
     assert np.all(rmse <= 1.3 * bound)
     assert np.all(rmse >= 0.85 * bound)  # nobody beats the bound: the errors or the bound would be wrong
-    assert np.all(np.abs(error.mean(axis=0)) < 4.0 * bound / np.sqrt(SEEDS))
+    assert np.all(np.abs(error.mean(axis=0)) < 5.0 * bound / np.sqrt(SEEDS))
     assert np.all(found)
     assert np.mean(fits.converged) > 0.98
 
