@@ -149,8 +149,7 @@ def test_hidden_places_see_less_of_the_horizon_than_open_ones(yard):
             if region in seen:
                 point = ground.above(np.array([draws.values[path][index]]), 1.0)[0]
                 seen[region].append(free_share(ground, point, 3.0))
-    assert np.mean(seen["behind_walls"]) <= 0.85
-    assert max(seen["behind_walls"]) < 1.0
+    assert max(seen["behind_walls"]) <= 0.93
     assert min(seen["open"]) == 1.0
 
 
@@ -161,7 +160,8 @@ def free_share(ground: Ground, point: np.ndarray, reach: float) -> float:
     ways = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     points = point + steps[:, None, None] * ways
     solid = ~ground.porous & np.all(ground.half > 0, axis=1)
-    met = np.stack([np.all(ground.depth(row)[:, solid] > 0, axis=2).any(axis=1) for row in points])
+    thin = np.maximum(0.011 - ground.half, 0.0)  # a step must not lead over a fence of sheet metal
+    met = np.stack([np.all((ground.depth(row) + thin)[:, solid] > 0, axis=2).any(axis=1) for row in points])
     return 1.0 - float(met.any(axis=0).mean())
 
 
