@@ -51,7 +51,9 @@ def check_references(document: Document, near: Path | None) -> list[Problem]:
         check("vehicle type", ("vehicles", i, "type"), types)
     for i in _indices(item(data, "sources")):
         check("nuclide", ("sources", i, "nuclide"), nuclides)
-    check("nuclide", ("localisation", "presumed_nuclide"), nuclides)
+    named = item(item(data, "knowledge"), "nuclides")
+    for i in _indices(named if isinstance(named, list | tuple) else None):
+        check("nuclide", ("knowledge", "nuclides", i), nuclides)
     return problems
 
 

@@ -18,6 +18,7 @@ _MOVED: dict[Place, str] = {
     ("ground", "spectrum_radius_m"): "identification.spectrum_radius_m",
     ("ground", "confidence_min"): "identification.confidence_min",
     ("time_step_s",): "timing.physics_steps",
+    ("localisation", "presumed_nuclide"): "knowledge.nuclides",
 }
 _CONTROL_PERIOD_S = 0.01
 
@@ -94,6 +95,8 @@ def _moved_text(place: Place, value: Any) -> str:
     if place == ("time_step_s",):
         return f"timing: {_flow({'control_period_s': _CONTROL_PERIOD_S, 'physics_steps': _physics_steps(value)})}"
     section, field = _MOVED[place].split(".")
+    if place == ("localisation", "presumed_nuclide"):
+        value = [value]
     return f"{section}: {_flow({field: value})}"
 
 

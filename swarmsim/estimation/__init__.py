@@ -4,29 +4,38 @@ Everything here is a pure function of one mission with fixed sizes (masks instea
 vmapped by the missions layer.
 """
 
-from swarmsim.estimation.hotspots import Hotspots, extract_hotspots, initial_points
+from swarmsim.estimation.hotspots import Hotspots, extract_hotspots
 from swarmsim.estimation.likelihood import cramer_rao_covariance, fisher_information, net_rates
-from swarmsim.estimation.localise import LocalisationParams, SourceFit, detected, localisation_params, localise
+from swarmsim.estimation.localise import (
+    Estimated,
+    LocalisationParams,
+    Presumed,
+    SourceFits,
+    localisation_params,
+    localise,
+    presume,
+)
 from swarmsim.estimation.measurements import Measurements, aggregate, concatenate
 from swarmsim.estimation.radiation_map import MappingParams, RadiationMap, interpolate, mapping_params
 
 __all__ = [
+    "Estimated",
     "Hotspots",
     "LocalisationParams",
     "MappingParams",
     "Measurements",
+    "Presumed",
     "RadiationMap",
-    "SourceFit",
+    "SourceFits",
     "aggregate",
     "concatenate",
     "cramer_rao_covariance",
-    "detected",
     "extract_hotspots",
     "fisher_information",
-    "initial_points",
     "interpolate",
     "localisation_params",
     "localise",
     "mapping_params",
     "net_rates",
+    "presume",
 ]

@@ -1,10 +1,9 @@
-"""Hotspots of a radiation map, and where the search for a source starts."""
+"""Hotspots of a radiation map."""
 
 import jax
 import jax.numpy as jnp
 
 from swarmsim.estimation.radiation_map import MappingParams, RadiationMap
-from swarmsim.estimation.search import GOLDEN_ANGLE_RAD
 from swarmsim.pytree import pytree
 
 
@@ -49,17 +48,3 @@ def extract_hotspots(params: MappingParams, radiation_map: RadiationMap) -> Hots
         significance=significance.reshape(-1)[index],
         valid=valid,
     )
-
-
-def initial_points(params: MappingParams, hotspots: Hotspots, starts: int) -> jax.Array:
-    """Starting points [starts, 2] (m, world ENU) of a localisation: the hotspots, then points around the strongest.
-
-    The latter lie on a spiral out to twice the map's length scale, for a source that walls hide from straight above.
-    """
-    kept = min(hotspots.valid.shape[0], starts)
-    i = jnp.arange(starts)
-    radius = 2.0 * params.length_scale_m * jnp.sqrt(i / starts)
-    angle = GOLDEN_ANGLE_RAD * i
-    around = hotspots.position_m[0] + radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
-    own = jnp.pad(hotspots.position_m[:kept], ((0, starts - kept), (0, 0)))
-    return jnp.where(jnp.pad(hotspots.valid[:kept], (0, starts - kept))[:, None], own, around)

@@ -1,198 +1,292 @@
-"""Localisation of one point source by the likelihood of the counts, with the full forward model of the measurement.
+"""Localisation: the number of sources, their places, activities and nuclides, from the counts by region of interest.
 
-A search from several starts (`swarmsim.estimation.search`) ends near the largest likelihood; damped Fisher scoring
-(Levenberg–Marquardt on the Poisson likelihood, Osborne 1992) goes the rest of the way. Places drawn round that maximum
-give the estimate, the mean of the posterior, and its covariance (`swarmsim.estimation.posterior`); in the open they are
-the maximum and the inverse of the information there.
+`problem_of` puts together what is known, `localise` finds the sources (`swarmsim.estimation.sources`) and samples the
+posterior of each (`swarmsim.estimation.posterior`).
 """
+
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from swarmsim.config.mission import Localisation
-from swarmsim.estimation.likelihood import (
-    Evaluation,
-    FitProblem,
-    evaluate,
-    in_blocks,
-    natural_background,
-    position_covariance,
-    position_of,
-    scaled_inverse,
-)
+from swarmsim.config.mission import Knowledge, Localisation
+from swarmsim.estimation.likelihood import natural_background
 from swarmsim.estimation.measurements import Measurements, cleared
-from swarmsim.estimation.posterior import Posterior, sample_posterior
-from swarmsim.estimation.search import (
-    LOG_STEP,
-    Bounds,
-    background_only,
-    bounds,
-    gradient_search,
-    pattern_search,
-)
-from swarmsim.pytree import pytree, static
-from swarmsim.radiation import Detector
-from swarmsim.site import Site
+from swarmsim.estimation.model import Problem, padded
+from swarmsim.estimation.posterior import posteriors
+from swarmsim.estimation.sources import SearchParams, State, find_sources, no_sources, ratios
+from swarmsim.pytree import on_host, pytree, static
+from swarmsim.radiation.coarse import coarse
+from swarmsim.radiation.detector import AIR, Detector
+from swarmsim.site import Site, sample, sample_with_gradient
+from swarmsim.site.model import height_at
 
-POSITION_STEP_M = 10.0  # longest Fisher step of a coordinate
-ENOUGH_EFFECTIVE = 4.0  # weighted places must be worth this many: the mean is then within half a standard deviation
+LINES = 8  # of a nuclide, to which neighbours are put together
+WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
+POINTS_MAX = 20_000  # of the grid of the first look
+ENOUGH_EFFECTIVE = 4.0  # weighted places must be worth this many
+HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
+
+
+@pytree
+class Presumed:
+    """What a mission presumes of the world when it estimates sources."""
+
+    site: Site  # with the materials that occur in it alone
+    detectors: tuple[Detector, ...]  # with few lines for each nuclide
+    material_std: jax.Array  # [M] of ln(true over presumed length); 0: exact
+    background_std: jax.Array  # [] of a window's ln(background over the level)
+    model_std: jax.Array  # [] of a window's ln(true over modelled rate)
+    pose_std_m: jax.Array  # [] of measured places
+    sensitivity_std: jax.Array  # [] of ln(true over presumed sensitivity) of a detector
+    ground_share: jax.Array  # [] of the nominal background, which falls with height
+    nuclides: jax.Array  # [N] bool, in question
+    points_m: jax.Array  # [C, 3] where sources are looked for first, world
+    height_m: jax.Array  # [] prior of a source's height above ground
+    height_std_m: jax.Array  # []
 
 
 @pytree
 class LocalisationParams:
     """Settings of `localise`."""
 
-    presumed_height_m: jax.Array  # [] prior mean of the source's height above ground
-    height_std_m: jax.Array  # [] its standard deviation; 0 = known
-    learning_rate_m: jax.Array  # [] first step of Adam
-    ground_share: jax.Array  # [] share of the nominal background that falls with height
-    search_radius_m: jax.Array  # [] reach of the first round of the pattern search
-    iterations: int = static()  # of Adam
-    search_rounds: int = static()  # of the pattern search
-    fisher_steps: int = static()  # of the polish
+    search: SearchParams
     sample_rounds: int = static()  # of the posterior's places
     samples: int = static()  # places in a round
     rays: int = static()  # to a window, along its way
 
 
 @pytree
-class SourceFit:
-    """The estimate of one source: mean and covariance of the posterior."""
+class SourceFits:
+    """Estimates of K sources, the surest first: mean and covariance of the posterior of each."""
 
-    position_m: jax.Array  # [3] m, world ENU
-    activity_bq: jax.Array  # []
-    background_scale: jax.Array  # [] background over the detectors' nominal one
-    covariance_m2: jax.Array  # [3, 3] of the position; bounded by the site's size where the data say nothing
-    activity_std_bq: jax.Array  # []
-    log_likelihood: jax.Array  # [] nats, relative to the saturated model, at its maximum
-    log_likelihood_background_only: jax.Array  # [] the same without a source, background scale fitted
-    detection: jax.Array  # [] twice their difference: generalised likelihood ratio, see `detected`
-    reduced_deviance: jax.Array  # [] about 1 for a model that describes the counts; tens: a local optimum, more sources
-    effective_samples: jax.Array  # [] number of independent places that the posterior's weighted ones are worth
+    present: jax.Array  # [K] bool
+    position_m: jax.Array  # [K, 3] m, world ENU
+    covariance_m2: jax.Array  # [K, 3, 3]
+    activity_bq: jax.Array  # [K]
+    activity_std_bq: jax.Array  # [K]
+    nuclide: jax.Array  # [K] int32
+    nuclide_confidence: jax.Array  # [K] posterior of that nuclide among those in question, from the survey's counts
+    detection: jax.Array  # [K] twice the logarithm of the likelihood ratio against the same without it
+    effective_samples: jax.Array  # [K] number of independent places that the posterior's weighted ones are worth
+    converged: jax.Array  # [K] bool: those are enough, and two halves of them agree
+
+
+@pytree
+class Estimated:
+    """What the counts tell of sources."""
+
+    fits: SourceFits
+    background_scale: jax.Array  # [] of the first detector model's nominal one
+    misfit: jax.Array  # [] standard deviations by which Pearson's chi-squared exceeds its degrees of freedom
+    chi_squared: jax.Array  # [] over its degrees of freedom, about 1 for a model that describes the counts
     windows: jax.Array  # [] number of valid ones
-    converged: jax.Array  # [] bool: those are enough for a mean, and the place is within the site
+    state: State  # to go on from when there are more counts
 
 
-def localisation_params(spec: Localisation, ground_share: float = 0.0) -> LocalisationParams:
-    """Settings from the configuration (host); ``ground_share`` of the background falls with height."""
+def localisation_params(spec: Localisation) -> LocalisationParams:
+    """Settings from the configuration (host)."""
     return LocalisationParams(
-        presumed_height_m=jnp.float32(spec.presumed_height_m),
-        height_std_m=jnp.float32(spec.height_std_m),
-        learning_rate_m=jnp.float32(spec.learning_rate_m),
-        ground_share=jnp.float32(ground_share),
-        search_radius_m=jnp.float32(spec.search_radius_m),
-        iterations=spec.iterations,
-        search_rounds=spec.search_rounds,
-        fisher_steps=spec.fisher_steps,
+        search=SearchParams(
+            threshold=on_host(spec.detection_sigma**2),
+            reach_m=on_host(spec.search_radius_m),
+            screened=spec.screened,
+            rounds=spec.search_rounds,
+            sources_max=spec.sources_max,
+        ),
         sample_rounds=spec.sample_rounds,
         samples=spec.samples,
         rays=spec.rays_per_window,
     )
 
 
-def localise(
+def presume(
     site: Site,
     detectors: tuple[Detector, ...],
-    measurements: Measurements,
-    initial_xy: jax.Array,
-    nuclide: jax.Array,
-    params: LocalisationParams,
-    extra_rate_cps: jax.Array | float = 0.0,
-) -> SourceFit:
-    """Estimate position, activity and background of a source of known nuclide.
+    spec: Localisation,
+    knowledge: Knowledge,
+    ground_share: float,
+    corners_m: np.ndarray,
+) -> Presumed:
+    """What a mission with that ``knowledge`` presumes (host).
 
     Args:
-        site: the known site (attenuation).
-        detectors: what ``measurements.detector`` indexes; all share one likelihood.
-        measurements: windows, about a second each.
-        initial_xy: [S, 2] starting points, m, world ENU (`initial_points`).
-        nuclide: [] int32 index in the library's order.
-        params: settings.
-        extra_rate_cps: [] or [n] net rate of sources known already (`net_rates`), to find several in turn.
-
-    Returns:
-        The fit. It always exists: ask `detected` whether there is a source at all.
+        site: the true site, of which the knowledge leaves out what is not known.
+        detectors: the true models.
+        spec: of the estimate.
+        knowledge: of the world.
+        ground_share: of the nominal background, which comes from the ground.
+        corners_m: [V, 2] of the area in which sources are sought.
     """
-    m = cleared(measurements)
-    extra = jnp.broadcast_to(jnp.asarray(extra_rate_cps, jnp.float32), m.counts.shape)
-    order = in_blocks(m)
-    m, extra = jax.tree.map(lambda leaf: leaf[order], (m, extra))
-    problem = FitProblem(
-        site=site,
-        detectors=detectors,
-        measurements=m,
-        nuclide=nuclide,
-        natural=natural_background(site, detectors, m, params.ground_share),
-        extra_cps=jnp.where(m.valid, extra, 0.0),
-        height_m=params.presumed_height_m,
-        height_std_m=params.height_std_m,
-        rays=params.rays,
+    known = _known_site(site, knowledge)
+    used = _materials_of(known)
+    names = tuple(known.material_names[i] for i in used)
+    new = np.zeros(len(known.material_names), np.int32)
+    new[used] = np.arange(len(used))
+    known = replace(
+        known,
+        material_names=names,
+        ground_material=new[int(known.ground_material)],
+        obstacles=replace(known.obstacles, material=new[np.asarray(known.obstacles.material)]),
     )
-    limits = bounds(problem)
-    log_scale, without_source = background_only(problem)
-    candidates = gradient_search(problem, limits, initial_xy, log_scale, params.learning_rate_m, params.iterations)
-    best = pattern_search(problem, limits, candidates, log_scale, params.search_radius_m, params.search_rounds)
-    theta, found = _polish(problem, limits, best, params.fisher_steps)
-    # Where the data say nothing, a coordinate is known to the range it was sought in: uniform, variance range² / 12.
-    covariance = scaled_inverse(found.information + jnp.diag(12.0 / jnp.square(limits[1] - limits[0])))
-    posterior = sample_posterior(problem, limits, theta, covariance, log_scale, params.sample_rounds, params.samples)
-    return _report(problem, limits, posterior, found, without_source)
+    ground = names[int(known.ground_material)]
+    # the standard deviation of a uniform distribution over +- share
+    std = knowledge.thickness_share / 3.0**0.5 if knowledge.site == "geometry" else 0.0
+    material_std = [0.0 if name in (AIR, ground) else std for name in names]
+    nuclides = detectors[0].nuclide_names
+    chosen = [knowledge.nuclides == "unknown" or name in knowledge.nuclides for name in nuclides]
+    model = knowledge.model_std if knowledge.site in ("exact", "geometry") else max(knowledge.model_std, BLIND_STD)
+    return Presumed(
+        site=known,
+        detectors=tuple(coarse(d, LINES, names) for d in detectors),
+        material_std=on_host(material_std),
+        background_std=on_host(knowledge.background_std),
+        model_std=on_host(model),
+        pose_std_m=on_host(knowledge.pose_std_m),
+        sensitivity_std=on_host(knowledge.sensitivity_std),
+        ground_share=on_host(ground_share),
+        nuclides=on_host(chosen, bool),
+        points_m=on_host(_grid(known, corners_m, spec.grid_m, spec.presumed_height_m)),
+        height_m=on_host(spec.presumed_height_m),
+        height_std_m=on_host(spec.height_std_m),
+    )
 
 
-def detected(fit: SourceFit, significance_sigma: jax.Array | float) -> jax.Array:
-    """Whether there is a source: the likelihood ratio exceeds ``significance_sigma`` squared.
+BLIND_STD = 0.5
+"""Of a window's rate where walls are not known: two thirds of what a brick wall leaves of 662 keV."""
 
-    At one given place twice the log likelihood ratio of an activity >= 0 is, without a source, half a chi-square of
-    one degree of freedom (Chernoff 1954), so its root exceeds s with chance Q(s); the search over places multiplies
-    this by about the number of detector footprints in the site (some tens), which 5 sigma (Q = 2.9e-7) leaves far
-    below one per cent.
+
+def _known_site(site: Site, knowledge: Knowledge) -> Site:
+    """The site without what is not known of it."""
+    if knowledge.site in ("exact", "geometry"):
+        return site
+    boxes = site.obstacles
+    nothing = replace(
+        boxes,
+        centre_m=np.asarray(boxes.centre_m)[:1],
+        half_extent_m=np.zeros((1, 3), np.float32),
+        axis=np.asarray(boxes.axis)[:1],
+        wall_m=np.zeros(1, np.float32),
+        material=np.asarray(boxes.material)[:1],
+    )
+    site = replace(site, obstacles=nothing)
+    if knowledge.site == "terrain":
+        return site
+    terrain = np.asarray(site.terrain_m)
+    return replace(site, terrain_m=np.full_like(terrain, terrain.mean()), above=None)
+
+
+def _materials_of(site: Site) -> list[int]:
+    """Numbers of the materials that rays can cross."""
+    solid = np.asarray(site.obstacles.half_extent_m)[:, 0] > 0.0
+    used = set(np.asarray(site.obstacles.material)[solid].tolist()) | {int(site.ground_material)}
+    return sorted(used | {site.material_names.index(AIR)})
+
+
+def _grid(site: Site, corners_m: np.ndarray, step_m: float, height_m: float) -> np.ndarray:
+    """Points [C, 3] over the area, ``step_m`` apart, farther where there would be too many."""
+    low, high = np.min(corners_m, axis=0), np.max(corners_m, axis=0)
+    step = max(step_m, float(np.sqrt(np.prod(high - low) / POINTS_MAX)))
+    axes = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True)]
+    xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    return np.column_stack([xy, height_at(site, xy) + height_m])
+
+
+def problem_of(
+    presumed: Presumed, measurements: Measurements, spans: tuple[tuple[int, int, int], ...], rays: int
+) -> Problem:
+    """The data of an estimate; ``spans`` say which rows which detector model measured (`spans_of`)."""
+    m = cleared(measurements)
+    assert m.rois is not None
+    natural = natural_background(presumed.site, presumed.detectors, m, presumed.ground_share)
+    regions = m.rois.shape[1]
+    nominal = jnp.concatenate(
+        [
+            jnp.broadcast_to(padded(presumed.detectors[k].background_rois, regions), (last - first, regions))
+            for first, last, k in spans
+        ]
+    )
+    travel = jnp.sum(jnp.square(m.travel_m), axis=-1)
+    return Problem(
+        site=presumed.site,
+        detectors=presumed.detectors,
+        measurements=m,
+        background=nominal * (natural * m.exposure_s)[:, None],
+        material_std=jnp.asarray(presumed.material_std),
+        background_std=jnp.asarray(presumed.background_std),
+        model_std=jnp.asarray(presumed.model_std),
+        pose_std_m=jnp.sqrt(jnp.square(presumed.pose_std_m) + WAY_SHARE**2 * travel),
+        height_m=jnp.asarray(presumed.height_m),
+        height_std_m=jnp.asarray(presumed.height_std_m),
+        spans=spans,
+        rays=rays,
+    )
+
+
+def localise(
+    presumed: Presumed,
+    measurements: Measurements,
+    spans: tuple[tuple[int, int, int], ...],
+    params: LocalisationParams,
+    known: State | None = None,
+) -> Estimated:
+    """Find all sources that the counts tell of.
+
+    Args:
+        presumed: what is known of the world.
+        measurements: windows with their counts by region of interest, detector model by detector model.
+        spans: rows from, to, and the detector model of each part (`spans_of`; static).
+        params: settings.
+        known: an earlier estimate's state, to go on from.
     """
-    return fit.detection > jnp.square(significance_sigma)
+    problem = problem_of(presumed, measurements, spans, params.rays)
+    points, nuclides = jnp.asarray(presumed.points_m), jnp.asarray(presumed.nuclides)
+    state = no_sources(problem, params.search.sources_max, nuclides.shape[0])
+    if known is not None:
+        # the windows are others now
+        state = replace(
+            state,
+            sources=known.sources,
+            unknowns=replace(state.unknowns, level=known.unknowns.level, lengths=known.unknowns.lengths),
+        )
+    state = find_sources(problem, points, nuclides, params.search, state)
+    return _report(presumed, problem, params, state)
 
 
-def _polish(problem: FitProblem, limits: Bounds, theta: jax.Array, steps: int) -> tuple[jax.Array, Evaluation]:
-    """Damped Fisher scoring from ``theta`` [5]: the end point and the likelihood there."""
-    reach = jnp.array([POSITION_STEP_M, POSITION_STEP_M, POSITION_STEP_M, LOG_STEP, LOG_STEP])
-    Carry = tuple[jax.Array, Evaluation, jax.Array, jax.Array]
+def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Estimated:
+    site, s, m = presumed.site, state.sources, problem.measurements
+    posterior, overall = posteriors(problem, state, params.sample_rounds, params.samples)
+    detection = ratios(problem, state)
+    mean, covariance = posterior.mean, posterior.covariance
+    log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std)
+    height = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(mean[:, :2])
+    activity = jnp.exp(mean[:, 3])
 
-    def step(carry: Carry, _: None) -> tuple[Carry, None]:
-        theta, here, damping, trial = carry
-        there = evaluate(problem, trial)
-        better = there.log_posterior >= here.log_posterior
-        theta, here = jax.tree.map(lambda a, b: jnp.where(better, a, b), (trial, there), (theta, here))
-        damping = jnp.clip(damping * jnp.where(better, 0.1, 10.0), 1e-6, 1e4)
-        damped = here.information + damping * jnp.diag(jnp.diagonal(here.information))
-        move = scaled_inverse(damped) @ here.score
-        move = move * jnp.minimum(1.0, jnp.min(reach / jnp.maximum(jnp.abs(move), 1e-9)))
-        return (theta, here, damping, jnp.clip(theta + move, *limits)), None
+    def in_space(at: jax.Array, c: jax.Array) -> jax.Array:
+        _, slope = sample_with_gradient(site.terrain_m, site, at[:2])
+        turn = jnp.eye(3).at[2, :2].set(slope)
+        return turn @ c[:3, :3] @ turn.T
 
-    unknown = -jnp.asarray(jnp.inf)
-    nowhere = Evaluation(
-        log_likelihood=unknown, log_posterior=unknown, score=jnp.zeros(5), information=jnp.eye(5)
-    )  # worse than any place: the first trial, the start itself, is taken
-    (theta, here, _, _), _ = jax.lax.scan(step, (theta, nowhere, jnp.asarray(1e-2), theta), None, length=steps + 1)
-    return theta, here
-
-
-def _report(
-    problem: FitProblem, limits: Bounds, posterior: Posterior, best: Evaluation, without_source: jax.Array
-) -> SourceFit:
-    """The fit of a posterior and the largest likelihood found."""
-    low, high = limits
-    theta, covariance = posterior.mean, posterior.covariance
-    inside = jnp.all((theta[:2] > low[:2]) & (theta[:2] < high[:2]))
-    activity = jnp.exp(theta[3])
-    return SourceFit(
-        position_m=position_of(problem.site, theta),
+    share = jax.nn.softmax(s.nuclide_value, axis=1)
+    fits = SourceFits(
+        present=s.present,
+        position_m=mean[:, :3].at[:, 2].add(height),
+        covariance_m2=jax.vmap(in_space)(mean, covariance),
         activity_bq=activity,
-        background_scale=jnp.exp(theta[4]),
-        covariance_m2=position_covariance(problem.site, theta, covariance),
-        activity_std_bq=activity * jnp.sqrt(covariance[3, 3]),
-        log_likelihood=best.log_likelihood,
-        log_likelihood_background_only=without_source,
-        detection=jnp.maximum(2.0 * (best.log_likelihood - without_source), 0.0),
-        reduced_deviance=-2.0 * best.log_likelihood / jnp.maximum(jnp.sum(problem.measurements.valid) - 5, 1),
+        activity_std_bq=activity * jnp.sqrt(log_variance),
+        nuclide=s.nuclide,
+        nuclide_confidence=jnp.take_along_axis(share, s.nuclide[:, None], axis=1)[:, 0],
+        detection=detection,
         effective_samples=posterior.effective,
-        windows=jnp.sum(problem.measurements.valid),
-        converged=(posterior.effective >= ENOUGH_EFFECTIVE) & inside,
+        converged=(posterior.effective >= ENOUGH_EFFECTIVE) & (posterior.halves <= HALVES_AGREE),
+    )
+    order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))
+    return Estimated(
+        fits=jax.tree.map(lambda x: x[order], fits),
+        background_scale=jnp.exp(state.unknowns.level[0]),
+        misfit=(overall.chi_squared - overall.freedom) / overall.spread,
+        chi_squared=overall.chi_squared / overall.freedom,
+        windows=jnp.sum(m.valid),
+        state=replace(state, sources=jax.tree.map(lambda x: x[order], s)),
     )

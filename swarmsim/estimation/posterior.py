@@ -6,15 +6,20 @@ under rounding, and its curvature says nothing about the uncertainty. The mean o
 
 Places are drawn in rounds, each from a normal distribution with the moments that the earlier ones gave, and weighted
 with the posterior over the mixture of all distributions drawn from (adaptive multiple importance sampling: Cornuet,
-Marin, Mira and Robert, Scandinavian Journal of Statistics 39, 2012, 798). Activity and background are at their best
-for each place; their own spread about it is normal.
+Marin, Mira and Robert, Scandinavian Journal of Statistics 39, 2012, 798). Whatever else is unknown is fitted at each
+place; its own spread about that is normal.
 """
+
+from collections.abc import Callable
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.likelihood import FitProblem
-from swarmsim.estimation.search import Bounds, best_at
+from swarmsim.estimation.likelihood import height_precision, scaled_inverse
+from swarmsim.estimation.model import MEAN_FLOOR, Problem, _normal
+from swarmsim.estimation.search import attempt, bounds
+from swarmsim.estimation.sources import ALONE_STEPS, State, _alone, without
 from swarmsim.pytree import pytree
 
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
@@ -26,53 +31,56 @@ WIDE_EVERY = 4  # one place in so many comes from a distribution `WIDE` times as
 WIDE = 2.5
 LEAST_EFFECTIVE = 16.0  # weights are flattened until they count as this many when the next round is placed
 LEAST_STD_M = 1e-3
+WEIGH_STEPS = 1  # Gauss-Newton steps at a place
 
 
 @pytree
 class Weighed:
-    """Places and their posterior."""
+    """Places and their posterior; leading axes of any shape."""
 
-    theta: jax.Array  # [K, n, 5] with the activity and the background that suit each place best
-    log_posterior: jax.Array  # [K, n]
-    nuisance: jax.Array  # [K, n, 2, 2] covariance of log activity and log background with the place held
+    place: jax.Array  # [..., 3] x, y, height above the ground
+    log_activity: jax.Array  # [...] of the best fit there
+    variance: jax.Array  # [...] of the logarithm of the activity, the place held
+    log_posterior: jax.Array  # [...]
+
+
+@pytree
+class Goodness:
+    """Pearson's chi-squared of the fit of all sources."""
+
+    chi_squared: jax.Array  # []
+    freedom: jax.Array  # [] degrees of freedom
+    spread: jax.Array  # [] standard deviation of chi-squared
 
 
 @pytree
 class Posterior:
-    """Moments of theta = (x, y, height above the ground, log activity in Bq, log background scale)."""
+    """Moments of (x, y, height above the ground, log activity in Bq)."""
 
-    mean: jax.Array  # [5]
-    covariance: jax.Array  # [5, 5]
+    mean: jax.Array  # [4]
+    covariance: jax.Array  # [4, 4]
     effective: jax.Array  # [] number of independent places that the weighted ones are worth
+    halves: jax.Array  # [] distance between the means of two halves of the places, in standard deviations
 
 
 def sample_posterior(
-    problem: FitProblem,
-    bounds: Bounds,
-    start: jax.Array,
-    covariance: jax.Array,
-    log_scale: jax.Array,
-    rounds: int,
-    per_round: int,
+    weigh: Callable[[jax.Array], Weighed], start: jax.Array, covariance: jax.Array, rounds: int, per_round: int
 ) -> Posterior:
-    """Moments of the posterior around ``start`` [5], whose covariance near it is about ``covariance`` [5, 5]."""
-    low, high = bounds
+    """Moments of the posterior around ``start`` [3], whose covariance near it is about ``covariance`` [3, 3].
+
+    ``weigh`` gives the posterior at a place [3].
+    """
     even = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(_EVEN), 1.0)
     normal = jax.scipy.special.ndtri(jnp.clip(even, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
     normal = normal * jnp.where(jnp.arange(per_round) % WIDE_EVERY == 0, WIDE, 1.0)[:, None]
 
-    def weigh(place: jax.Array) -> Weighed:
-        theta, value, spread = best_at(problem, place, log_scale)
-        inside = jnp.all((place >= low[:3]) & (place <= high[:3]))
-        return Weighed(
-            theta=theta, log_posterior=jnp.where(inside & jnp.isfinite(value), value, -jnp.inf), nuisance=spread
-        )
-
     # The places of rounds to come have no weight yet, and their distributions no density.
+    none = jnp.zeros((rounds, per_round))
     empty = Weighed(
-        theta=jnp.zeros((rounds, per_round, 5)),
+        place=jnp.zeros((rounds, per_round, 3)),
+        log_activity=none,
+        variance=none,
         log_posterior=jnp.full((rounds, per_round), -jnp.inf),
-        nuisance=jnp.zeros((rounds, per_round, 2, 2)),
     )
     means, roots = jnp.zeros((rounds, 3)), jnp.broadcast_to(jnp.eye(3), (rounds, 3, 3))
     Carry = tuple[Weighed, jax.Array, jax.Array, jax.Array, jax.Array]
@@ -85,21 +93,36 @@ def sample_posterior(
         drawn = jax.lax.map(weigh, mean + normal @ root.T)
         known = jax.tree.map(lambda all_, new: all_.at[k].set(new), known, drawn)
         weight = _flattened(_log_weights(known, means, roots, k), LEAST_EFFECTIVE)
-        mean, covariance = _moments(known.theta[..., :3], weight)
+        mean, covariance = _moments(known.place, weight)
         return (known, means, roots, mean, SPREAD**2 * covariance + LEAST_STD_M**2 * jnp.eye(3)), None
 
-    first = FIRST_SPREAD**2 * covariance[:3, :3] + LEAST_STD_M**2 * jnp.eye(3)
-    carry: Carry = (empty, means, roots, start[:3], first)
+    first = FIRST_SPREAD**2 * covariance + LEAST_STD_M**2 * jnp.eye(3)
+    carry: Carry = (empty, means, roots, start, first)
     known, means, roots, _, _ = jax.lax.scan(round_, carry, (jnp.arange(rounds), normal))[0]
-    weight = _truncated(_log_weights(known, means, roots, jnp.asarray(rounds - 1)))
-    mean, covariance = _moments(known.theta, weight)
-    own = jnp.einsum("kn,knij->ij", weight, known.nuisance)
-    return Posterior(mean=mean, covariance=covariance.at[3:, 3:].add(own), effective=_effective(weight))
+    log_weights = _log_weights(known, means, roots, jnp.asarray(rounds - 1))
+    weight = _flattened(log_weights, LEAST_EFFECTIVE)
+    effective = _effective(_truncated(log_weights))
+    values = jnp.concatenate([known.place, known.log_activity[..., None]], axis=-1)
+    mean, covariance = _moments(values, weight)
+    covariance = covariance.at[3, 3].add(jnp.sum(weight * known.variance))
+    return Posterior(
+        mean=mean, covariance=covariance, effective=effective, halves=_halves(values, log_weights, covariance)
+    )
+
+
+def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array) -> jax.Array:
+    """How far the means of the even and the odd places of each round lie apart, in standard deviations of x and y."""
+    odd = jnp.arange(values.shape[1]) // WIDE_EVERY % 2 == 1  # both halves have their share of wide ones
+    means = [
+        _moments(values, _truncated(jnp.where(half, log_weights, -jnp.inf)))[0] for half in (odd, jnp.logical_not(odd))
+    ]
+    apart = jnp.abs(means[0] - means[1])[:2] / jnp.sqrt(jnp.maximum(jnp.diagonal(covariance)[:2], LEAST_STD_M**2))
+    return jnp.max(apart)
 
 
 def _log_weights(known: Weighed, means: jax.Array, roots: jax.Array, last: jax.Array) -> jax.Array:
     """Logarithms [K, n] of posterior over mixture of the distributions of the rounds up to ``last``."""
-    offset = known.theta[..., None, :3] - means  # [K, n, K, 3]
+    offset = known.place[..., None, :] - means  # [K, n, K, 3]
     scaled = jnp.einsum("qij,knqj->knqi", _inverse(roots), offset)
     scale = jnp.sum(jnp.log(jnp.diagonal(roots, axis1=-2, axis2=-1)), axis=-1)
     squared = jnp.sum(scaled**2, axis=-1)
@@ -162,3 +185,54 @@ def _moments(values: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array
     mean = w @ offset
     apart = offset - mean
     return origin + mean, (apart * w[:, None]).T @ apart
+
+
+def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> tuple[Posterior, Goodness]:
+    """Moments [K] of the posterior of every source, the places of the others held; and how well all of them fit.
+
+    The moments mean nothing where there is no source.
+    """
+    s = state.sources
+
+    def one(k: jax.Array) -> Posterior:
+        zero = jnp.zeros(())
+        nothing = Posterior(mean=jnp.zeros(4), covariance=jnp.eye(4), effective=zero, halves=zero)
+        return jax.lax.cond(s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing)
+
+    return jax.lax.map(one, jnp.arange(s.present.shape[0])), goodness(problem, state)
+
+
+def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_round: int) -> Posterior:
+    limits, s = bounds(problem), state.sources
+    others = without(state, k).added
+    u, nuclide = replace(state.unknowns, activity_bq=s.activity_bq[k]), s.nuclide[k]
+
+    def weigh(place: jax.Array) -> Weighed:
+        fit = attempt(problem, nuclide, others, u, place, WEIGH_STEPS, False).fit
+        inside = jnp.all((place >= limits[0]) & (place <= limits[1]))
+        return Weighed(
+            place=place,
+            log_activity=jnp.log(jnp.maximum(fit.unknowns.activity_bq, 1e-3)),
+            variance=fit.covariance[0, 0],
+            log_posterior=jnp.where(inside, fit.value, -jnp.inf),
+        )
+
+    known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
+    known = known.at[2].set(height_precision(problem.height_std_m))
+    covariance = scaled_inverse(s.towards[k] + jnp.diag(known))
+    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round)
+
+
+def goodness(problem: Problem, state: State) -> Goodness:
+    """How well the sources of ``state`` describe the counts."""
+    m = problem.measurements
+    assert m.rois is not None
+    u, model = _alone(problem, state.added, state.unknowns, ALONE_STEPS)
+    at = _normal(problem, model, u)
+    mean = jnp.maximum(model.mean, MEAN_FLOOR)
+    cells = m.valid[:, None] & (problem.background > 0.0)
+    return Goodness(
+        chi_squared=jnp.sum(jnp.where(cells, jnp.square(m.rois - model.mean) / mean, 0.0)),
+        freedom=jnp.maximum(jnp.sum(cells) - at.fitted - 4.0 * jnp.sum(state.sources.present), 1.0),
+        spread=jnp.sqrt(jnp.sum(jnp.where(cells, 2.0 + 1.0 / mean, 0.0))),
+    )

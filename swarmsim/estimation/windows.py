@@ -69,6 +69,32 @@ def gather(windows: Windows, samples: Measurements, new: jax.Array, per_window: 
     )
 
 
+def merged(windows: Windows, most: int) -> Windows:
+    """The windows of each vehicle in at most ``most`` (static): as many neighbours put together as it takes."""
+    used = windows.exposure_s > 0.0
+    total = jnp.sum(used, axis=1)
+    together = jnp.maximum(1, -(-total // most))
+    number = (jnp.cumsum(used, axis=1) - 1) // together[:, None]
+    slot = jnp.where(used, number, most)
+    vehicle = jnp.broadcast_to(jnp.arange(used.shape[0])[:, None], slot.shape)
+
+    def add(value: jax.Array) -> jax.Array:
+        empty = jnp.zeros((used.shape[0], most, *value.shape[2:]), value.dtype)
+        return empty.at[vehicle, slot].add(value, mode="drop")
+
+    latest = jnp.zeros((used.shape[0], most)).at[vehicle, slot].max(windows.time_s, mode="drop")
+    return Windows(
+        samples=windows.samples,
+        time_s=latest,
+        position_m=add(windows.position_m),
+        travel_m=add(windows.travel_m),
+        axis=add(windows.axis),
+        counts=add(windows.counts),
+        exposure_s=add(windows.exposure_s),
+        rois=add(windows.rois),
+    )
+
+
 def measured(windows: Windows, detector: int) -> Measurements:
     """The windows as measurements [U W] of detector model ``detector``; unused ones are not valid."""
     valid = windows.exposure_s > 0.0

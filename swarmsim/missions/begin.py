@@ -45,7 +45,7 @@ def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionStat
         phase_of=tuple(jnp.full(group.size, NO_PHASE, jnp.int32) for group in world.groups),
         belief=None if plan.mapping is None else recursive_map.start(plan.mapping, plan.bin_cells),
         windows=windows,
-        survey=_no_survey(world, plan, windows),
+        survey=_no_survey(world, plan, windows, key),
         over_s=jnp.asarray(jnp.inf, jnp.float32),
     )
     seen = views(world, plan, state, mission.belief)
@@ -56,11 +56,11 @@ def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionStat
     return mission, Signals(begin=begin, running=running, active=active, over=jnp.array(False))
 
 
-def _no_survey(world: World, plan: Plan, windows: Any) -> Survey | None:
+def _no_survey(world: World, plan: Plan, windows: Any, key: jax.Array) -> Survey | None:
     """Room for a survey, where a phase asks for the source."""
     if not any(phase.target == "source" for phase in plan.phases):
         return None
-    shape = jax.eval_shape(lambda: knowledge.survey(plan, knowledge.gathered(world, windows)))
+    shape = jax.eval_shape(lambda: knowledge.survey(plan, *knowledge.gathered(world, plan, windows, key)))
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
 
 
@@ -164,8 +164,8 @@ def _situation(world: World, phase: Phase, mission: MissionState, target_m: jax.
 def _target(world: World, plan: Plan, phase: Phase, mission: MissionState) -> tuple[MissionState, jax.Array, jax.Array]:
     """The mission with what was learned for it, the place [2] that the phase goes to, and whether [] there is one."""
     if phase.target == "source":
-        learned = knowledge.survey(plan, knowledge.gathered(world, mission.windows))
-        return replace(mission, survey=learned), learned.fit.position_m[:2], learned.found
+        learned = knowledge.survey(plan, *knowledge.gathered(world, plan, mission.windows, mission.world.key))
+        return replace(mission, survey=learned), learned.estimated.fits.position_m[0, :2], learned.found
     if phase.target == "hotspot":
         assert plan.mapping is not None
         assert mission.belief is not None

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmsim.estimation import LocalisationParams, MappingParams
+from swarmsim.estimation import LocalisationParams, MappingParams, Presumed
 from swarmsim.policies import registry
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector
@@ -128,12 +128,12 @@ class Plan:
     detectors: tuple[Detector, ...]  # of the team, by model: what `Measurements.detector` indexes
     mapping: MappingParams | None
     localisation: LocalisationParams | None
-    presumed_nuclide: jax.Array  # [] int32, hypothesis until a nuclide is identified
+    presumed: Presumed | None  # for the estimate
     spectrum_radius_m: jax.Array  # [] spectra are taken within this distance of the estimate
     confidence_min: jax.Array  # [] of the identification, to replace the presumed nuclide
     phases: tuple[Phase, ...]
     per_window: tuple[int, ...] = static()  # for each group: samples in a window of the estimate
     windows: tuple[int, ...] = static()  # for each group: windows that its vehicles can fill
-    starts: int = static()  # starting points of the estimate
+    kept: tuple[int, ...] = static()  # for each group: windows of each vehicle that the estimate uses
     bin_cells: int = static()  # side of a bin of the team's belief, in cells of the map
     spectrometer: int = static()  # detector model whose spectra are identified; -1 for none

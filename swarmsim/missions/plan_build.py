@@ -10,7 +10,7 @@ from swarmsim.config.mission import Phase as PhaseSpec
 from swarmsim.config.mission import Trigger as TriggerSpec
 from swarmsim.config.policies import ParallelLines
 from swarmsim.config.scenario import Scenario
-from swarmsim.estimation import localisation_params, mapping_params
+from swarmsim.estimation import localisation_params, mapping_params, presume
 from swarmsim.estimation.radiation_map import MappingParams
 from swarmsim.estimation.recursive_map import default_bin_cells
 from swarmsim.kept import kept
@@ -19,9 +19,9 @@ from swarmsim.policies import registry
 from swarmsim.policies.protocol import Assignment
 from swarmsim.pytree import on_host
 from swarmsim.site import SiteModel
-from swarmsim.world.build import detector_models, grouped, library_of
+from swarmsim.world.build import detector_models, grouped
 from swarmsim.world.kinds import KINDS
-from swarmsim.world.model import World
+from swarmsim.world.model import Group, World
 
 
 def listens(scenario: Scenario) -> bool:
@@ -38,30 +38,30 @@ def _policy(scenario: Scenario, phase: PhaseSpec) -> PolicyReference:
 
 def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
     """The plan of a checked scenario."""
-    mission, library = scenario.mission, library_of(scenario)
+    mission = scenario.mission
     counters = {g.counter.index: g.counter for g in reversed(world.groups) if g.counter is not None}
     detectors = tuple(counters[i].detector for i in range(len(detector_models(scenario))))
     localisation, identification = mission.localisation, mission.identification
-    nuclide = 0 if localisation is None else library.nuclide_index(localisation.presumed_nuclide)
     per_window, windows = _windows(scenario, world)
-    mapping = None
+    mapping = presumed = None
+    corners = _surveyed(scenario, site_model)
+    if localisation is not None and detectors:
+        ground_share = mission.background.ground_share
+        presumed = presume(site_model.site, detectors, localisation, mission.knowledge, ground_share, corners)
     if mission.mapping is not None and detectors:
-        corners = _surveyed(scenario, site_model)
         mapping = _kept_mapping(mission.mapping, tuple(map(tuple, corners.tolist())))
     return Plan(
         site=site_model.site,
         detectors=detectors,
         mapping=mapping,
-        localisation=None
-        if localisation is None or not detectors
-        else localisation_params(localisation, scenario.mission.background.ground_share),
-        presumed_nuclide=on_host(nuclide, np.int32),
+        localisation=None if presumed is None or localisation is None else localisation_params(localisation),
+        presumed=presumed,
         spectrum_radius_m=on_host(0.0 if identification is None else identification.spectrum_radius_m),
         confidence_min=on_host(1.0 if identification is None else identification.confidence_min),
         phases=tuple(_phase(scenario, site_model, i) for i in range(len(mission.phases))),
         per_window=per_window,
         windows=windows,
-        starts=1 if localisation is None else localisation.starts,
+        kept=tuple(_kept_windows(group) for group in world.groups),
         bin_cells=1 if mapping is None else default_bin_cells(mapping),
         spectrometer=-1 if identification is None else _spectrometer(world),
     )
@@ -105,6 +105,15 @@ def _windows(scenario: Scenario, world: World) -> tuple[tuple[int, ...], tuple[i
         per_window.append(together)
         windows.append(math.ceil(limit_s / (sample_s * together)) + 1 if limit_s else 0)
     return tuple(per_window), tuple(windows)
+
+
+ROWS = {True: 264, False: 160}
+"""Windows of the estimate of all vehicles of a group that flies, or drives; their neighbours are put together."""
+ROWS_LEAST = 16  # of one vehicle
+
+
+def _kept_windows(group: Group) -> int:
+    return max(ROWS_LEAST, ROWS[KINDS[group.kind].FLIES] // group.size)
 
 
 def _spectrometer(world: World) -> int:

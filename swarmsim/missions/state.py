@@ -4,7 +4,7 @@ from typing import Any
 
 import jax
 
-from swarmsim.estimation import Hotspots, RadiationMap, SourceFit
+from swarmsim.estimation import Estimated, Hotspots, RadiationMap
 from swarmsim.estimation.recursive_map import Binned
 from swarmsim.estimation.windows import Windows
 from swarmsim.policies.path import Path
@@ -16,12 +16,12 @@ NO_PHASE = -1
 
 @pytree
 class Survey:
-    """What the counts told: a map, its hotspots, and an estimate of a source."""
+    """What the counts told: a map, its hotspots, and an estimate of the sources."""
 
     map: RadiationMap
     hotspots: Hotspots
-    fit: SourceFit
-    found: jax.Array  # [] bool: there is a hotspot above the background
+    estimated: Estimated
+    found: jax.Array  # [] bool: there is a source
 
 
 @pytree

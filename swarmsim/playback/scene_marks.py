@@ -24,14 +24,16 @@ def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: 
         _pin(stream, f"truth/{k}", source.position_m, 7.0, label, TRUTH, static=True)
     stream.set_time(TIMELINE, duration=float(record.surveyed_s))
     _send_hotspots(stream, record, site_model)
-    if record.survey_estimate is not None:
-        _estimate(stream, "estimate/survey", record.survey_estimate, "survey", _SURVEY_ESTIMATE)
+    for k, one in enumerate(record.survey_estimates):
+        _estimate(stream, f"estimate/survey/{k}", one, "survey", _SURVEY_ESTIMATE)
     stream.set_time(TIMELINE, duration=float(record.end_s))
-    if record.estimate is not None:
-        _estimate(stream, "estimate/final", record.estimate, "final", ESTIMATE)
+    for k, one in enumerate(record.estimates):
+        _estimate(stream, f"estimate/final/{k}", one, "final", ESTIMATE)
+    if record.estimates:
         # The first guess has served; two pins a metre apart only hide each other.
-        stream.log("world/estimate/survey/pin", rr.Clear(recursive=True))
-        stream.log("world/labels/estimate/survey", rr.Clear(recursive=True))
+        for k in range(len(record.survey_estimates)):
+            stream.log(f"world/estimate/survey/{k}/pin", rr.Clear(recursive=True))
+            stream.log(f"world/labels/estimate/survey/{k}", rr.Clear(recursive=True))
     stream.reset_time()
 
 

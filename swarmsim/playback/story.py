@@ -25,12 +25,8 @@ def story(record: MissionRecord) -> list[tuple[float, str, str]]:
         lines.append((min(event.time_s, end), _LEVEL.get(event.kind, "INFO"), text))
     for x, y in () if record.map is None else record.map.hotspots_m:
         lines.append((surveyed, "INFO", f"hotspot at {x:.1f} m east, {y:.1f} m north"))
-    for when, name, estimate in (
-        (surveyed, "survey estimate", record.survey_estimate),
-        (end, "final estimate", record.estimate),
-    ):
-        if estimate is not None:
-            lines.append((when, "INFO", f"{name}: {describe(estimate)}"))
+    lines += [(surveyed, "INFO", f"survey estimate: {describe(one)}") for one in record.survey_estimates]
+    lines += [(end, "INFO", f"final estimate: {describe(one)}") for one in record.estimates]
     if record.spectrum is not None:
         named = spectrum_title(record.spectrum)
         lines.append((end, "INFO", f"spectrum of {record.spectrum.live_time_s:.0f} s live: {named}"))
@@ -44,7 +40,7 @@ def describe(estimate: Estimate) -> str:
     (x, y, z), (sx, sy, sz) = estimate.position_m, np.sqrt(np.diag(estimate.covariance_m2))
     return (
         f"{x:.2f} ± {sx:.2f} m east, {y:.2f} ± {sy:.2f} m north, {z:.2f} ± {sz:.2f} m up, "
-        f"{estimate.activity_mbq:.1f} ± {estimate.activity_std_mbq:.1f} MBq"
+        f"{estimate.activity_mbq:.1f} ± {estimate.activity_std_mbq:.1f} MBq {estimate.nuclide}"
     )
 
 
@@ -71,9 +67,9 @@ def page(record: MissionRecord) -> str:
         for s in record.sources
     )
     found = "\n".join(
-        f"- {name}: {describe(estimate)}"
-        for name, estimate in (("survey estimate", record.survey_estimate), ("final estimate", record.estimate))
-        if estimate is not None
+        f"- {name}: {describe(one)}"
+        for name, estimates in (("survey estimate", record.survey_estimates), ("final estimate", record.estimates))
+        for one in estimates
     )
     warnings = "".join(f"\n\nWarning: {warning}" for warning in record.warnings)
     return (

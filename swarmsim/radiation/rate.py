@@ -138,6 +138,48 @@ def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.
     return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares)
 
 
+def roi_rates_and_slopes(
+    detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """`roi_rates` [n, R] of n places, and their derivatives [n, M, R] by ln(length in each material).
+
+    The derivatives leave out that the spectrum of the scattered photons softens with depth.
+
+    Args:
+        detector: of all places.
+        source: one.
+        way: fields [n, M], from the source to each place.
+        position_m, axis: [n, 3] of the crystal.
+    """
+    nuclide = source.nuclide
+    seen = jax.vmap(lambda place, along: _seen(detector, source, place, along))(position_m, axis)  # [n, L]
+    layers = way.length_m[:, None, :] * detector.attenuation_1_m[nuclide]  # [n, L, M]
+    depth = jnp.sum(layers, axis=-1)
+    direct = seen * jnp.exp(-depth)
+    peaks = detector.peak_rois[nuclide]  # [L, R]
+    if detector.kind == "paper_ideal":
+        slopes = -jnp.einsum("nlm,nl,lr->nmr", layers, direct, peaks)
+        return direct @ peaks, slopes
+    first, last = POSITIONS
+    near = jnp.clip((last - way.place) / (last - first), 0.0, 1.0)
+    lengths = jnp.stack([near * way.length_m, (1.0 - near) * way.length_m], axis=1)  # [n, positions, M]
+    c = jnp.einsum("pclm,npm->ncl", detector.scatter_1_m[nuclide], lengths) / (depth + 1e-9)[:, None]
+    t = jnp.minimum(depth, DEPTH_MAX)
+    growth = c[:, 0] + c[:, 1] * t + c[:, 2] * jnp.log1p(t / DEPTH_SCALES[0]) + c[:, 3] * jnp.log1p(t / DEPTH_SCALES[1])
+    steep = c[:, 1] + c[:, 2] / (DEPTH_SCALES[0] + t) + c[:, 3] / (DEPTH_SCALES[1] + t)
+    falling = seen * jnp.exp(growth - depth)
+    scattered = depth * falling
+    by_depth = falling * (1.0 + depth * (jnp.where(depth < DEPTH_MAX, steep, 0.0) - 1.0))
+    low, high = SPECTRUM_DEPTHS
+    deep = jnp.clip((depth - low) / (high - low), 0.0, 1.0)
+    part = jnp.where(depth[..., None] > 1e-6, layers / jnp.maximum(depth, 1e-6)[..., None], 1.0 / layers.shape[-1])
+    mixed = jnp.stack([(1.0 - deep)[..., None] * part, deep[..., None] * part], axis=2)  # [n, L, depths, M]
+    shares = jnp.einsum("nldm,dmlr->nlr", mixed, detector.scattered_rois[nuclide])
+    rates = direct @ peaks + jnp.einsum("nl,nlr->nr", scattered, shares)
+    each = by_depth[..., None] * shares - direct[..., None] * peaks
+    return rates, jnp.sum(layers[..., None] * each[:, :, None], axis=1)
+
+
 def observed_rois(detector: Detector, net_cps: jax.Array, background: jax.Array | float = 1.0) -> jax.Array:
     """Counts per second [..., R] after dead time of net rates [..., R], with the background (`observed_rate`).
 

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from swarmsim.estimation import SourceFit
+from swarmsim.estimation import Estimated
 from swarmsim.missions.state import MissionState
 from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.radiation.rate import highest_rate
@@ -22,7 +22,7 @@ from swarmsim.results.record import (
     TrueSource,
     VehicleRecord,
 )
-from swarmsim.results.status import Diagnostics, Verdict, assess
+from swarmsim.results.status import Fit, Verdict, assess
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.site.model import height_at
@@ -48,19 +48,19 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     tracks = [_tracks(batch, index, group) for group in range(len(simulation.world.groups))]
     vehicles = [_vehicle(simulation, tracks, end, number) for number in range(len(simulation.scenario.members))]
     conclusion = None if batch.conclusion is None else _row(batch.conclusion, index)
-    found = conclusion is not None and bool(conclusion.survey.found)
     nuclides = _nuclides(simulation)
-    survey_estimate = estimate = spectrum = None
-    if found and conclusion is not None:
-        presumed = int(simulation.plan.presumed_nuclide)
-        survey_estimate = _estimate(conclusion.survey.fit, nuclides[presumed])
-        estimate = _estimate(conclusion.fit, nuclides[int(conclusion.nuclide)])
+    surveyed: tuple[Estimate, ...] = ()
+    final: tuple[Estimate, ...] = ()
+    spectrum = None
+    if conclusion is not None:
+        surveyed = _estimates(conclusion.survey.estimated, nuclides)
+        final = _estimates(conclusion.estimated, nuclides)
         spectrum = _spectrum(simulation, conclusion)
     samples = _samples(simulation, batch, index, phases)
     chart = None if conclusion is None else _map(simulation, conclusion.survey)
     verdict = None
     if conclusion is not None and chart is not None:
-        verdict = _verdict(simulation, samples, chart, conclusion, survey_estimate, estimate)
+        verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final)
     return MissionRecord(
         name=simulation.scenario.mission.name,
         site=simulation.site_model.name,
@@ -70,14 +70,16 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         samples=samples,
         sought=_sought(simulation),
         map=chart,
-        survey_estimate=survey_estimate,
+        survey_estimate=next(iter(surveyed), None),
+        survey_further=surveyed[1:],
         surveyed_s=_surveyed_s(simulation, end),
-        estimate=estimate,
+        estimate=next(iter(final), None),
+        further=final[1:],
         spectrum=spectrum,
         sources=true_sources(simulation, batch.worlds.of(index)),
         paths_m=_paths(simulation, end),
         events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
-        finding=_finding(verdict, estimate, spectrum, _no_way(simulation, end)),
+        finding=_finding(verdict, final, spectrum, _no_way(simulation, end)),
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
         warnings=(CROWDED,) if bool(end.world.crowded) else (),
@@ -230,14 +232,23 @@ def _nuclides(simulation: Simulation) -> tuple[str, ...]:
     return simulation.plan.detectors[0].nuclide_names if simulation.plan.detectors else ()
 
 
-def _estimate(fit: SourceFit, nuclide: str) -> Estimate:
-    return Estimate(
-        position_m=np.asarray(fit.position_m),
-        covariance_m2=np.asarray(fit.covariance_m2) + LEAST_STD_M**2 * np.eye(3),
-        activity_mbq=float(fit.activity_bq) * 1e-6,
-        activity_std_mbq=float(np.hypot(fit.activity_std_bq, LEAST_STD_SHARE * fit.activity_bq)) * 1e-6,
-        background_scale=float(fit.background_scale),
-        nuclide=nuclide,
+def _estimates(estimated: Estimated, nuclides: tuple[str, ...]) -> tuple[Estimate, ...]:
+    """The sources found, the surest first."""
+    fits = estimated.fits
+    return tuple(
+        Estimate(
+            position_m=np.asarray(fits.position_m[k]),
+            covariance_m2=np.asarray(fits.covariance_m2[k]) + LEAST_STD_M**2 * np.eye(3),
+            activity_mbq=float(fits.activity_bq[k]) * 1e-6,
+            activity_std_mbq=float(np.hypot(fits.activity_std_bq[k], LEAST_STD_SHARE * fits.activity_bq[k])) * 1e-6,
+            background_scale=float(estimated.background_scale),
+            nuclide=nuclides[int(fits.nuclide[k])],
+            nuclide_confidence=float(fits.nuclide_confidence[k]),
+            detection=float(fits.detection[k]),
+            effective_samples=float(fits.effective_samples[k]),
+            converged=bool(fits.converged[k]),
+        )
+        for k in np.flatnonzero(np.asarray(fits.present))
     )
 
 
@@ -312,11 +323,11 @@ def _verdict(
     samples: Samples,
     chart: RadiationMap,
     conclusion: Any,
-    aerial: Estimate | None,
-    final: Estimate | None,
+    aerial: tuple[Estimate, ...],
+    final: tuple[Estimate, ...],
 ) -> Verdict:
     """Status of the mission's answer."""
-    fit, detectors = conclusion.fit, simulation.plan.detectors
+    estimated, detectors = conclusion.estimated, simulation.plan.detectors
     used = np.full(len(simulation.scenario.members), -1)
     for group in simulation.world.groups:
         if group.counter is not None:
@@ -324,57 +335,64 @@ def _verdict(
     of_vehicle = used[samples.vehicle]
     highest = np.array([highest_rate(detector) for detector in detectors])
     background = np.array([float(detector.background_cps) for detector in detectors])
-    diagnostics = Diagnostics(
-        reduced_deviance=float(fit.reduced_deviance),
-        windows=int(fit.windows),
-        effective_samples=float(fit.effective_samples),
-        converged=bool(fit.converged),
-        detection=float(fit.detection),
-    )
+    fit = Fit(misfit=float(estimated.misfit), chi_squared=float(estimated.chi_squared))
     ground = height_at(simulation.site_model.site, np.asarray(samples.position_m, float)[:, :2])
     return assess(
         samples,
         chart,
         (highest[of_vehicle], background[of_vehicle]),
         ground,
-        final is not None,
-        diagnostics,
+        fit,
         aerial,
         final,
     )
 
 
-def _finding(verdict: Verdict | None, estimate: Estimate | None, spectrum: Spectrum | None, no_way: bool) -> str:
+def _finding(verdict: Verdict | None, final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool) -> str:
     """What was found, and why it is not to be believed where it is not."""
     if verdict is None:
         return NOTHING_SOUGHT
-    found = _found(estimate, spectrum, no_way)
+    found = _found(final, spectrum, no_way)
     if not verdict.reasons:
         return found
     return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
 
 
-def _found(estimate: Estimate | None, spectrum: Spectrum | None, no_way: bool) -> str:
-    if estimate is None:
+def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool) -> str:
+    if not final:
         return NOTHING_FOUND
+    first = _surest(final[0], spectrum, no_way)
+    if len(final) == 1:
+        return f"a source of {first}"
+    others = "; ".join(f"of {_placed(one)}" for one in final[1:])
+    return f"{len(final)} sources: of {first}; {others}"
+
+
+def _placed(estimate: Estimate) -> str:
     x, y = estimate.position_m[:2]
-    place = f"a source of {estimate.activity_mbq:.0f} MBq {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
+    return f"{estimate.activity_mbq:.0f} MBq {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
+
+
+def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool) -> str:
+    place = _placed(estimate)
     if no_way:
-        return f"{place}; nuclide presumed, no drivable way for the rover to reach it"
+        return f"{place}; nuclide by the survey's counts, no drivable way for the rover to reach it"
     if spectrum is None:
-        return f"{place}; nuclide presumed, no spectrum was taken near it"
+        return f"{place}; nuclide by the survey's counts, no spectrum was taken near it"
     return f"{place}; {_identified(estimate, spectrum)}"
 
 
 def _identified(estimate: Estimate, spectrum: Spectrum) -> str:
     """What the spectrum says of the nuclide under which the source was estimated."""
     if spectrum.nuclide == "none":
-        return "nuclide presumed, the spectrum shows none"
+        return "nuclide by the survey's counts, the spectrum shows none"
     if spectrum.nuclide == "unknown":
-        return f"nuclide presumed, the spectrum is of none in the library with {spectrum.confidence:.0%}"
+        return f"nuclide by the survey's counts, the spectrum is of none in the library with {spectrum.confidence:.0%}"
     said = f"identified with {spectrum.confidence:.1%}"
     if spectrum.nuclide != estimate.nuclide:
-        said = f"nuclide presumed, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
+        said = (
+            f"nuclide by the survey's counts, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
+        )
     if spectrum.goodness < BAD_FIT:
         said += f", but fits the spectrum badly (p = {spectrum.goodness:.1g})"
     return said

@@ -95,14 +95,18 @@ class RadiationMap:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A source estimate with its uncertainty (one standard deviation, from the Fisher information)."""
+    """A source estimate with its uncertainty (one standard deviation of the posterior)."""
 
     position_m: Floats  # [3]
     covariance_m2: Floats  # [3, 3]
     activity_mbq: float
     activity_std_mbq: float
     background_scale: float  # estimated background over the detector's nominal one
-    nuclide: str  # hypothesis under which it was fitted
+    nuclide: str  # for which it was estimated
+    nuclide_confidence: float = 1.0  # of that nuclide among those in question, by the regions of interest
+    detection: float = np.inf  # twice the logarithm of the likelihood ratio against the same without it
+    effective_samples: float = np.inf  # independent places that the posterior's weighted ones are worth
+    converged: bool = True  # those are enough, and two halves of them agree
 
 
 @dataclass(frozen=True)
@@ -157,7 +161,7 @@ class MissionRecord:
     map: RadiationMap | None  # of the counts until ``surveyed_s``
     survey_estimate: Estimate | None  # from the same counts; the last one that a phase went by
     surveyed_s: float  # when both were made
-    estimate: Estimate | None  # from all counts
+    estimate: Estimate | None  # from all counts, of the surest source
     spectrum: Spectrum | None
     sources: tuple[TrueSource, ...]
     paths_m: dict[int, Floats]  # last planned path [r, 3] of a vehicle by its index
@@ -166,7 +170,19 @@ class MissionRecord:
     status: str = "not_sought"  # what that is worth, see `swarmsim.results.status.Status`
     covered: float | None = None  # share of the survey area that was measured; None where nothing was sought
     warnings: tuple[str, ...] = ()  # what makes parts of the result doubtful
+    survey_further: tuple[Estimate, ...] = ()  # further sources by the survey's counts
+    further: tuple[Estimate, ...] = ()  # further sources by all counts
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """All sources found, the surest first."""
+        return () if self.estimate is None else (self.estimate, *self.further)
+
+    @property
+    def survey_estimates(self) -> tuple[Estimate, ...]:
+        """All sources by the survey's counts, the surest first."""
+        return () if self.survey_estimate is None else (self.survey_estimate, *self.survey_further)
 
     def phase(self, name: str) -> Phase | None:
         """The phase of a name; None where it did not begin."""

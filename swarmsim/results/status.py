@@ -1,13 +1,14 @@
 """What an answer is worth: a status and a sentence, from every diagnostic that the mission computed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from swarmsim.results.record import RadiationMap, Samples
+from swarmsim.results.record import Estimate, RadiationMap, Samples
 
 Floats = NDArray[np.floating]
 Status = Literal[
@@ -22,21 +23,18 @@ COVERED_SHARE = 0.8  # of the survey area must have been measured
 REACH_HEIGHTS = 1.0  # a measurement covers the ground around it up to its own height, at least `REACH_M`
 REACH_M = 8.0
 FAR_STD_M = 10.0  # a source known no better is detected, not located
-DEVIANCE_SIGMA, DEVIANCE_LEAST = 6.0, 1.15  # a reduced deviance above both contradicts the model
+MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
 
 
 @dataclass(frozen=True)
-class Diagnostics:
-    """What tells how far the fit of a source can be believed."""
+class Fit:
+    """How well the sources found describe the counts."""
 
-    reduced_deviance: float  # about 1 for a model that describes the counts
-    windows: int  # that were fitted
-    effective_samples: float  # of the posterior
-    converged: bool
-    detection: float  # likelihood ratio against no source
+    misfit: float  # standard deviations by which chi-squared exceeds its degrees of freedom
+    chi_squared: float  # over its degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -53,10 +51,9 @@ def assess(
     chart: RadiationMap,
     limits_cps: tuple[Floats, Floats],
     ground_m: Floats,
-    found: bool,
-    diagnostics: Diagnostics,
-    aerial: Any,
-    final: Any,
+    fit: Fit,
+    aerial: Sequence[Estimate],
+    final: Sequence[Estimate],
 ) -> Verdict:
     """Judge an answer.
 
@@ -65,25 +62,23 @@ def assess(
         chart: the radiation map, whose cells are the survey area.
         limits_cps: for each sample [n] the highest rate that its counter can show (inf: any), and its background.
         ground_m: height of the ground below each sample [n].
-        found: whether a source was found at all.
-        diagnostics: of the final fit.
-        aerial: estimate of the survey (`swarmsim.results.record.Estimate`), or None.
-        final: the same from all counts, or None.
+        fit: of all sources to all counts.
+        aerial: sources by the survey's counts.
+        final: sources by all counts, the surest first.
     """
     covered = coverage(samples, chart, ground_m)
     reasons = []
-    status: Status = "located" if found else "none"
+    status: Status = "located" if final else "none"
     if _saturated(samples, limits_cps):
         status = "saturated"
         reasons.append("a counter was driven into its dead time, so rates and places close to the source are doubtful")
     if covered < COVERED_SHARE:
         status = "incomplete_survey" if status in ("none", "located") else status
         reasons.append(f"only {covered:.0%} of the survey area was measured")
-    if found and final is not None:
-        doubts = _doubts(chart, diagnostics, aerial, final)
-        if doubts and status == "located":
-            status = doubts[0][0]
-        reasons += [sentence for _, sentence in doubts]
+    doubts = _doubts(chart, fit, aerial, final)
+    if doubts and status in ("located", "none"):
+        status = doubts[0][0]
+    reasons += [sentence for _, sentence in doubts]
     return Verdict(status, tuple(reasons), covered)
 
 
@@ -115,40 +110,61 @@ def _saturated(samples: Samples, limits_cps: tuple[Floats, Floats]) -> bool:
     return bool(counts[silent].sum() > 0.02 * counts.sum() + 50.0)
 
 
-def _doubts(chart: RadiationMap, diagnostics: Diagnostics, aerial: Any, final: Any) -> list[tuple[Status, str]]:
-    """Reasons not to call a source located, the gravest first."""
+def _doubts(
+    chart: RadiationMap, fit: Fit, aerial: Sequence[Estimate], final: Sequence[Estimate]
+) -> list[tuple[Status, str]]:
+    """Reasons not to believe the answer, the gravest first."""
     found: list[tuple[Status, str]] = []
-    spread = np.sqrt(2.0 / max(diagnostics.windows, 1))
-    if diagnostics.reduced_deviance > max(1.0 + DEVIANCE_SIGMA * spread, DEVIANCE_LEAST):
+    if fit.misfit > MISFIT_SIGMA and fit.chi_squared > MISFIT_LEAST:
         found.append((
             "inconsistent",
-            f"the counts contradict a single source as modelled (reduced deviance {diagnostics.reduced_deviance:.1f})",
+            f"the counts contradict the sources as modelled (chi-squared {fit.chi_squared:.2f} per degree of freedom, "
+            f"{fit.misfit:.0f} standard deviations too large)",
         ))  # fmt: skip
-    if aerial is not None:
-        found += _disagreement(aerial, final)
-    std = np.sqrt(np.maximum(np.diag(np.asarray(final.covariance_m2))[:2].max(), 0.0))
-    if not diagnostics.converged:
-        few = f"the search for the most likely place did not settle ({diagnostics.effective_samples:.0f} samples count)"
-        found.append(("detected", few))
-    elif std > FAR_STD_M:
-        found.append(("detected", f"its place is known to {std:.0f} m only"))
-    away = np.linalg.norm(np.asarray(chart.hotspots_m).reshape(-1, 2) - np.asarray(final.position_m)[:2], axis=1)
-    if np.any(away > UNEXPLAINED_M):
-        places = ", ".join(f"({x:.0f}, {y:.0f})" for x, y in np.asarray(chart.hotspots_m)[away > UNEXPLAINED_M][:4])
-        found.append(("ambiguous", f"hotspots far from it suggest further sources, at {places} m"))
+    for one in final:
+        found += _disagreement(aerial, one)
+    for one in final:
+        if not one.converged:
+            few = (
+                f"the places that fit the {one.nuclide} source could not be searched well enough to state their spread"
+            )
+            found.append(("ambiguous", few))
+    for one in final:
+        std = np.sqrt(np.maximum(np.linalg.eigvalsh(np.asarray(one.covariance_m2)[:2, :2])[-1], 0.0))
+        if std > FAR_STD_M:
+            found.append(("detected", f"the place of the {one.nuclide} source is known to {std:.0f} m only"))
+    found += _unexplained(chart, final)
     return found
 
 
-def _disagreement(aerial: Any, final: Any) -> list[tuple[Status, str]]:
-    apart = np.asarray(final.position_m, float)[:2] - np.asarray(aerial.position_m, float)[:2]
-    covariance = np.asarray(final.covariance_m2)[:2, :2] + np.asarray(aerial.covariance_m2)[:2, :2]
+def _unexplained(chart: RadiationMap, final: Sequence[Estimate]) -> list[tuple[Status, str]]:
+    """Hotspots of the map that no source found explains."""
+    hotspots = np.asarray(chart.hotspots_m, float).reshape(-1, 2)
+    places = np.array([np.asarray(one.position_m, float)[:2] for one in final]).reshape(-1, 2)
+    away = np.linalg.norm(hotspots[:, None] - places, axis=2).min(axis=1, initial=np.inf) > UNEXPLAINED_M
+    if not np.any(away) or not len(places):
+        return []
+    text = ", ".join(f"({x:.0f}, {y:.0f})" for x, y in hotspots[away][:4])
+    return [("ambiguous", f"hotspots far from what was found suggest further sources, at {text} m")]
+
+
+def _disagreement(aerial: Sequence[Estimate], final: Estimate) -> list[tuple[Status, str]]:
+    """Between a source and the survey's nearest one of the same nuclide; one that the survey did not show has none."""
+    alike = [one for one in aerial if one.nuclide == final.nuclide]
+    if not alike:
+        return []
+    place = np.asarray(final.position_m, float)[:2]
+    before = min(alike, key=lambda one: float(np.linalg.norm(np.asarray(one.position_m, float)[:2] - place)))
+    apart = place - np.asarray(before.position_m, float)[:2]
+    covariance = np.asarray(final.covariance_m2)[:2, :2] + np.asarray(before.covariance_m2)[:2, :2]
     covariance = covariance + MODEL_STD_M**2 * np.eye(2)
     if float(apart @ np.linalg.solve(covariance, apart)) > APART_SIGMA**2:
         distance = float(np.linalg.norm(apart))
-        return [("inconsistent", f"the estimates from the air and from all counts lie {distance:.0f} m apart")]
-    shares = [e.activity_std_mbq / max(e.activity_mbq, 1e-9) for e in (aerial, final)]
-    ratio = np.log(max(final.activity_mbq, 1e-9) / max(aerial.activity_mbq, 1e-9))
-    if aerial.nuclide == final.nuclide and abs(ratio) > APART_SIGMA * np.hypot(np.hypot(*shares), MODEL_STD_LOG):
-        text = f"the activities from the air and from all counts differ {np.exp(abs(ratio)):.3g} times"
+        text = f"the {final.nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
         return [("inconsistent", text)]
+    shares = [e.activity_std_mbq / max(e.activity_mbq, 1e-9) for e in (before, final)]
+    ratio = np.log(max(final.activity_mbq, 1e-9) / max(before.activity_mbq, 1e-9))
+    if abs(ratio) > APART_SIGMA * np.hypot(np.hypot(*shares), MODEL_STD_LOG):
+        text = f"the activity of the {final.nuclide} source by the survey and by all counts differs "
+        return [("inconsistent", f"{text}{np.exp(abs(ratio)):.3g} times")]
     return []

@@ -81,6 +81,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         },
         "survey_estimate": estimate_summary(record.survey_estimate, record.sources),
         "source": estimate_summary(record.estimate, record.sources),
+        "further_sources": [estimate_summary(one, record.sources) | {"nuclide": one.nuclide} for one in record.further],
         "nuclide": {
             "name": named(spectrum),
             "confidence": None if spectrum is None else float(spectrum.confidence),
@@ -241,6 +242,7 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
         row |= _axes(name, values.pop("position_m"), ("east_m", "north_m", "up_m"))
         row |= _axes(name, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
         row |= {f"{name}_{key}": value for key, value in values.items()}
+    row["sources_found"] = len(record.estimates)
     row["nuclide"] = named(record.spectrum)
     row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
     row["crashed"] = sum(bool(v.crashed) for v in record.vehicles)

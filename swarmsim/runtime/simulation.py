@@ -362,9 +362,9 @@ def _onward(verdict: tuple[Signals, jax.Array], _: Any) -> tuple[jax.Array, Any]
 
 def _conclude(world: World, plan: Plan, carried: tuple[jax.Array, MissionState]) -> Conclusion:
     key, mission = carried
-    measurements = gathered(world, mission.windows)
-    known = survey(plan, measurements) if mission.survey is None else mission.survey
-    return conclude(key, world, plan, known, measurements)
+    measurements = gathered(world, plan, mission.windows, key)
+    known = survey(plan, *measurements) if mission.survey is None else mission.survey
+    return conclude(key, world, plan, known, *measurements)
 
 
 def _segment_of(log: Log, ran: np.ndarray, periods: int) -> Segment:

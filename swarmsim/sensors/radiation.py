@@ -18,6 +18,26 @@ from swarmsim.vehicles.state import RigidState
 
 
 @pytree
+class Departures:
+    """How far the truth may depart from what is presumed of it; each mission draws its own from its key."""
+
+    thickness_share: jax.Array  # [M] walls of a material are up to so much thinner or thicker
+    sensitivity_std: jax.Array  # [] of the logarithm of a detector model's sensitivity
+
+
+def length_factors(departures: Departures, key: jax.Array) -> jax.Array:
+    """True over presumed length [M] in each material, in the mission of ``key``."""
+    share = jnp.asarray(departures.thickness_share)
+    return 1.0 + share * jax.random.uniform(randomness.consumer(key, "thickness"), share.shape, minval=-1.0)
+
+
+def sensitivity_factor(departures: Departures, key: jax.Array, index: int) -> jax.Array:
+    """True over presumed sensitivity [] of detector model ``index`` in the mission of ``key``."""
+    own = jax.random.fold_in(randomness.consumer(key, "sensitivity"), index)
+    return jnp.exp(departures.sensitivity_std * jax.random.normal(own))
+
+
+@pytree
 class Counter:
     """The detectors of a group: one model, mounted on each vehicle in its own way."""
 
@@ -88,11 +108,22 @@ def counter_start(vehicles: int, rois: int) -> CounterState:
     )
 
 
-def source_rate(site: Site, detector: Detector, sources: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
-    """Net count rates [R] that all sources (leading axis S) cause in a crystal at a place [3] with an axis [3]."""
+def source_rate(
+    site: Site,
+    detector: Detector,
+    sources: Source,
+    position_m: jax.Array,
+    axis: jax.Array,
+    lengths: jax.Array | float = 1.0,
+) -> jax.Array:
+    """Net count rates [R] that all sources (leading axis S) cause in a crystal at a place [3] with an axis [3].
+
+    ``lengths`` [M] are factors of the path length in each material.
+    """
 
     def one(source: Source) -> jax.Array:
         way = crossed(site, source.position_m, position_m)
+        way = replace(way, length_m=way.length_m * lengths)
         return roi_rates(detector, source, way, position_m, axis)
 
     return jnp.sum(jax.vmap(one)(sources), axis=0)
@@ -112,6 +143,7 @@ def count(
     site: Site,
     sources: Source,
     background: BackgroundField,
+    departures: Departures,
     key: jax.Array,
     tick: jax.Array,
     control_period_s: float,
@@ -128,7 +160,7 @@ def count(
         body: poses and velocities [U] then.
         active: [U] bool, vehicles that have a part in the mission.
         member: [U] int32, number of each vehicle in the mission.
-        site, sources, background: the true world.
+        site, sources, background, departures: the true world.
         key: of the mission; a draw depends on it, the time and the vehicle's number only.
         tick, control_period_s: the time; the first control period has the number 1.
         due: [] bool; without it the state is returned as it is.
@@ -147,8 +179,10 @@ def count(
 
     def evaluate() -> tuple[jax.Array, jax.Array]:
         """Observed rates [U, R], and counts [U, R] if the exposure ends now."""
-        rate = jax.vmap(lambda place, along: source_rate(site, counter.detector, sources, place, along))(centre, axis)
         own = jax.random.wrap_key_data(bits, impl=impl)
+        lengths, detector = length_factors(departures, own), counter.detector
+        rate = jax.vmap(lambda place, along: source_rate(site, detector, sources, place, along, lengths))(centre, axis)
+        rate = rate * sensitivity_factor(departures, own, counter.index)
         reference = counter.detector.background_height_m
         natural = jax.vmap(lambda place: background_factor(background, site, own, place, reference))(centre)
         rate = observed_rois(counter.detector, rate, natural)

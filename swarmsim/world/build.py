@@ -19,9 +19,9 @@ from swarmsim.kept import kept
 from swarmsim.physics.multirotor import check_time_step
 from swarmsim.pytree import on_host
 from swarmsim.radiation.background import SMOOTH_M, BackgroundField
-from swarmsim.radiation.detector import Detector, Source, build_detector
+from swarmsim.radiation.detector import AIR, Detector, Source, build_detector
 from swarmsim.radiation.library import Library
-from swarmsim.sensors.radiation import Counter
+from swarmsim.sensors.radiation import Counter, Departures
 from swarmsim.site import Site, SiteModel
 from swarmsim.site.landing_places import landing_places
 from swarmsim.site.model import height_at
@@ -85,6 +85,7 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
             gusts=_f32(mission.wind.gusts),
         ),
         background=_background(scenario, site),
+        departures=_departures(scenario, site),
         traffic=TrafficRules(
             separation_m=_f32(mission.traffic.separation_m),
             ground_separation_m=_f32(mission.traffic.ground_separation_m),
@@ -100,6 +101,13 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
         timing=timing,
         engine=mission.engine,
     )
+
+
+def _departures(scenario: Scenario, site: Site) -> Departures:
+    knowledge = scenario.mission.knowledge
+    share = np.full(len(site.material_names), knowledge.thickness_share if knowledge.site == "geometry" else 0.0)
+    share[[site.material_names.index(AIR), int(site.ground_material)]] = 0.0
+    return Departures(thickness_share=_f32(share), sensitivity_std=_f32(knowledge.sensitivity_std))
 
 
 def _background(scenario: Scenario, site: Site) -> BackgroundField:

@@ -58,6 +58,6 @@ def counted(
         due = running & (tick <= first + ticks)
         counter_state = count(
             counter, counter_state, body, measuring, group.member, world.site, world.sources, world.background,
-            key, tick, world.timing.control_period_s, due, branch,
+            world.departures, key, tick, world.timing.control_period_s, due, branch,
         )  # fmt: skip
     return replace(after, counter=counter_state)

@@ -12,7 +12,7 @@ from swarmsim.pytree import pytree, static
 from swarmsim.radiation.background import BackgroundField
 from swarmsim.radiation.detector import Source
 from swarmsim.scalars import Layout
-from swarmsim.sensors.radiation import Counter
+from swarmsim.sensors.radiation import Counter, Departures
 from swarmsim.site import Site
 from swarmsim.site.walls import Walls
 from swarmsim.world.failsafes import FailsafeRules
@@ -110,6 +110,7 @@ class World:
     sources: Source  # leading axis S >= 1; a source of no activity stands in for none
     air: Air
     background: BackgroundField
+    departures: Departures
     traffic: TrafficRules
     failsafes: FailsafeRules
     radio: Radio

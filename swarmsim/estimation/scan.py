@@ -1,0 +1,135 @@
+"""Where a further source would explain the counts, and of which nuclide: a score statistic over a grid, without rays.
+
+At a grid point the statistic is s^2 / I with s the derivative of the log likelihood by the activity at zero, and I the
+information about it, the background's level in every window and the activities of the sources known so far eliminated:
+chi-square of one degree of freedom without a source. In the open the rate of a nuclide depends on the distance alone,
+up to the direction to the crystal, so that both are matrix products: (points x windows) (windows x nuclides).
+"""
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.estimation.model import Others, Problem, Unknowns, _linear, _normal, detector_of, padded
+from swarmsim.pytree import pytree
+from swarmsim.radiation.detector import Detector, Source
+from swarmsim.radiation.rate import roi_rates_and_slopes
+from swarmsim.site.rays import Crossed
+
+NODES_M = (3.0, 30.0, 100.0)
+"""Distances at which the rates are computed; rates times squared distance are linear between them."""
+SINE = 0.7071  # of the angle between the crystal's axis and the direction to the source
+LEAST_M = 3.0  # closer windows count as if they were this far: where a source is near, the grid is too coarse for them
+
+
+@pytree
+class Scanned:
+    """The statistic of every grid point."""
+
+    statistic: jax.Array  # [C] largest over the nuclides
+    nuclide: jax.Array  # [C] int32 which one that is
+    activity_bq: jax.Array  # [C] that it has by the score
+
+
+def open_rates(detector: Detector, nuclides: int, air: int) -> jax.Array:
+    """Counts/s per Bq times squared distance [N, nodes, R] in air; ``air`` is its number among the materials."""
+    distance = jnp.array(NODES_M)
+    zero = jnp.zeros_like(distance)
+    place = jnp.stack([distance * SINE, zero, distance * (1.0 - SINE**2) ** 0.5], axis=-1)
+    up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), place.shape)
+    length = jnp.zeros((len(NODES_M), len(detector.material_names))).at[:, air].set(distance)
+    way = Crossed(length_m=length, place=jnp.full_like(length, 0.5))
+
+    def of(nuclide: jax.Array) -> jax.Array:
+        source = Source(position_m=jnp.zeros(3), activity_bq=jnp.ones(()), nuclide=nuclide)
+        return roi_rates_and_slopes(detector, source, way, place, up)[0] * jnp.square(distance)[:, None]
+
+    return jax.lax.map(of, jnp.arange(nuclides))
+
+
+def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Others, u: Unknowns) -> Scanned:
+    """The statistic at ``points_m`` [C, 3] (world) for the nuclides that are ``allowed`` [N].
+
+    ``others`` are the sources known so far, and ``u`` is the fit with them alone (its own activity
+    is zero).
+    """
+    m, regions = problem.measurements, problem.background.shape[1]
+    assert m.rois is not None
+    nothing = jnp.zeros((m.counts.shape[0], u.lengths.shape[0], regions))
+    model = _linear(problem, jnp.zeros_like(m.rois), nothing, others, jnp.zeros(3), u)
+    at = _normal(problem, model, u)
+    weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, 1e-3), 0.0)
+    names, models = problem.detectors[0].material_names, detector_of(problem)
+    air = names.index("air") if "air" in names else 0
+    kernels = [padded(open_rates(d, allowed.shape[0], air), regions) for d in problem.detectors]
+    kernel = jnp.stack(kernels)  # [D, N, J, R]
+    share = jnp.sum(model.mean, axis=1) / jnp.maximum(jnp.sum(_true(problem, others, u), axis=1), 1e-9)
+    scale = m.exposure_s * share  # [n]
+
+    # what is common to all windows: the others' factors and the levels
+    k, d = u.others.shape[0], u.level.shape[0]
+    common = model.common[:, :, 1 : 1 + k + d]
+
+    def eliminated(x: jax.Array) -> jax.Array:
+        """V^-1 x [n, R, ...]: the windows' own background and gain eliminated."""
+        weighted = weight.reshape(*weight.shape, *[1] * (x.ndim - 2)) * x
+        inside = jnp.einsum("nab,nrb,nr...->na...", at.own, model.own, weighted)
+        return weighted - weight.reshape(*weight.shape, *[1] * (x.ndim - 2)) * jnp.einsum(
+            "nra,na...->nr...", model.own, inside
+        )
+
+    left = eliminated(m.rois - model.mean)  # [n, R]
+    across = eliminated(common)  # [n, R, Q]
+    shape = scale[:, None, None, None] * jnp.einsum("nd,dcjr->ncjr", models, kernel)  # [n, N, J, R]
+    pushes = jnp.einsum("ncjr,nr->ncj", shape, left)
+    crossings = jnp.einsum("ncjr,nrq->ncjq", shape, across)
+    inner = jnp.einsum("nra,nr,ncjr->ncja", model.own, weight, shape)
+    own = jnp.einsum("ncjr,nr,ncir->ncji", shape, weight, shape)
+    own = own - jnp.einsum("ncja,nab,ncib->ncji", inner, at.own, inner)
+
+    phi = _weights(points_m, m.position_m, m.valid)  # [J, C, n]
+    nodes = len(NODES_M)
+    score = sum(phi[j] @ pushes[:, :, j] for j in range(nodes))
+    information = sum(
+        (phi[i] * phi[j]) @ own[:, :, i, j] * (1.0 if i == j else 2.0) for i in range(nodes) for j in range(i, nodes)
+    )
+    flat = crossings.reshape(*crossings.shape[:1], -1, nodes, k + d).transpose(2, 0, 1, 3)
+    cross = sum(phi[j] @ flat[j].reshape(flat.shape[1], -1) for j in range(nodes))
+    cross = cross.reshape(points_m.shape[0], allowed.shape[0], k + d)
+    of_common = jnp.einsum("nrp,nrq->pq", common, across) + 1e-4 * jnp.eye(k + d)
+    half = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(of_common), jnp.eye(k + d))
+    information = information - jnp.einsum("ncp,pq,ncq->nc", cross, half, cross)
+    information = jnp.maximum(information, 1e-30)
+    score = score - jnp.einsum("ncp,pq,q->nc", cross, half, jnp.einsum("nrp,nr->p", common, left))
+    statistic = jnp.where(allowed, jnp.square(jnp.maximum(score, 0.0)) / information, -1.0)
+    best = jnp.argmax(statistic, axis=1)
+    chosen = best[:, None]
+    return Scanned(
+        statistic=jnp.take_along_axis(statistic, chosen, axis=1)[:, 0],
+        nuclide=best.astype(jnp.int32),
+        activity_bq=jnp.take_along_axis(score / information, chosen, axis=1)[:, 0],
+    )
+
+
+def _true(problem: Problem, others: Others, u: Unknowns) -> jax.Array:
+    background = problem.background * jnp.exp(detector_of(problem) @ u.level + u.background)[:, None]
+    return background + jnp.sum(others.counts * u.others[:, None, None], axis=0) * jnp.exp(u.gain)[:, None]
+
+
+def _weights(points_m: jax.Array, windows_m: jax.Array, valid: jax.Array) -> jax.Array:
+    """Weights [J, C, n] of the nodes for every point and window, over the squared distance."""
+    apart = points_m[:, None] - windows_m
+    distance = jnp.maximum(jnp.sqrt(jnp.sum(apart * apart, axis=-1)), LEAST_M)
+    place = jnp.interp(distance, jnp.array(NODES_M), jnp.arange(len(NODES_M), dtype=jnp.float32))
+    shares = jnp.maximum(1.0 - jnp.abs(place - jnp.arange(len(NODES_M), dtype=jnp.float32)[:, None, None]), 0.0)
+    return jnp.where(valid, shares / jnp.square(distance), 0.0)
+
+
+def strongest(scanned: Scanned, points_m: jax.Array, count: int, apart_m: float) -> tuple[jax.Array, jax.Array]:
+    """Numbers [count] of the grid points with the largest statistic, each ``apart_m`` from the others; and those."""
+
+    def next_(statistic: jax.Array, _: None) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        k = jnp.argmax(statistic)
+        away = jnp.linalg.norm(points_m[:, :2] - points_m[k, :2], axis=1)
+        return jnp.where(away < apart_m, -jnp.inf, statistic), (k, statistic[k])
+
+    return jax.lax.scan(next_, scanned.statistic, None, length=count)[1]
