@@ -18,18 +18,12 @@ from numpy.typing import NDArray
 
 from swarmsim.config.radiation import Material
 from swarmsim.radiation.elements import CUT_KEV, ELECTRON_KEV
-from swarmsim.radiation.interactions import (
-    KEV_ANGSTROM,
-    Interactions,
-    form_factor_squared,
-    interactions,
-)
+from swarmsim.radiation.interactions import coherent_density, interactions, klein_nishina, scattered_fraction
 from swarmsim.radiation.scattering import BINS
 
 Floats = NDArray[np.float64]
 
 COLLISIONS = 60
-_MOLIERE_A, _MOLIERE_B = (0.1, 0.55, 0.35), (6.0, 1.2, 0.3)
 
 
 class Medium(NamedTuple):
@@ -80,22 +74,14 @@ def medium(material: Material, energy_kev: float, response: Callable[[Floats], F
         lines=f32(np.array([(s.alpha_kev, s.beta_kev, s.alpha_share) for s in table.shells]).reshape(-1, 3)),
         compton_cosine=f32(table.compton_cosine),
         coherent_cosine=f32(table.coherent_cosine),
-        compton_norm=f32([np.trapezoid(_kn(e, cosine), cosine) for e in energy]),
-        coherent_norm=f32([np.trapezoid(_rayleigh(table, e, cosine), cosine) for e in energy]),
+        compton_norm=f32([np.trapezoid(klein_nishina(e, cosine), cosine) for e in energy]),
+        coherent_norm=f32(
+            [np.trapezoid(coherent_density(e, cosine, table.weights, table.screening), cosine) for e in energy]
+        ),
         weights=f32(table.weights),
         screening=f32(table.screening),
         response=f32(np.ones_like(energy) if response is None else response(energy) / response(np.array([energy_kev]))),
     )
-
-
-def _kn(energy: float, cosine: np.ndarray) -> np.ndarray:
-    ratio = 1.0 / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
-    return 0.5 * ratio**2 * (ratio + 1.0 / ratio - 1.0 + cosine**2)
-
-
-def _rayleigh(table: Interactions, energy: float, cosine: np.ndarray) -> np.ndarray:
-    transfer = 4.0 * np.pi * energy / KEV_ANGSTROM * np.sqrt(0.5 * (1.0 - cosine))
-    return form_factor_squared(transfer, table.weights, table.screening) * (1.0 + cosine**2)
 
 
 def _at(m: Medium, values: jax.Array, energy: jax.Array) -> jax.Array:
@@ -148,7 +134,7 @@ def collide(
     is_pair = (choice >= coherent + compton) & (choice < coherent + compton + pair)
     cosine = _drawn(m, m.compton_cosine, energy, u, v)
     cosine = jnp.where(is_coherent, _drawn(m, m.coherent_cosine, energy, u, v), cosine)
-    scattered = energy / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
+    scattered = energy * scattered_fraction(energy, cosine)
     new = jnp.where(is_coherent, energy, jnp.where(is_compton, scattered, jnp.where(is_pair, ELECTRON_KEV, 0.0)))
     if m.lines.shape[0]:
         ends = coherent + compton + pair
@@ -179,16 +165,11 @@ def _next_events(
 ) -> tuple[tuple[jax.Array, jax.Array], ...]:
     """Energy [n] after, and density [n] per steradian of, each kind of interaction that sends a photon ``toward``."""
     cosine = jnp.clip(jnp.sum(direction * toward, axis=1), -1.0, 1.0)
-    ratio = 1.0 / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
-    kn = 0.5 * ratio**2 * (ratio + 1.0 / ratio - 1.0 + cosine**2) / _at(m, m.compton_norm, energy)
-    transfer = 4.0 * jnp.pi * energy / KEV_ANGSTROM * jnp.sqrt(0.5 * (1.0 - cosine))
-    factor = 0.0
-    for a, b in zip(_MOLIERE_A, _MOLIERE_B, strict=True):
-        factor = factor + a / (1.0 + (transfer[:, None] * m.screening / b) ** 2)
-    rayleigh = (factor**2 @ m.weights) * (1.0 + cosine**2) / _at(m, m.coherent_norm, energy)
+    kn = klein_nishina(energy, cosine) / _at(m, m.compton_norm, energy)
+    rayleigh = coherent_density(energy, cosine, m.weights, m.screening) / _at(m, m.coherent_norm, energy)
     per_steradian, isotropic = 1.0 / (2.0 * jnp.pi), 1.0 / (4.0 * jnp.pi)
     events = [
-        (energy * ratio, _at(m, m.compton, energy) * kn * per_steradian),
+        (energy * scattered_fraction(energy, cosine), _at(m, m.compton, energy) * kn * per_steradian),
         (energy, _at(m, m.coherent, energy) * rayleigh * per_steradian),
         (jnp.full_like(energy, ELECTRON_KEV), 2.0 * _at(m, m.pair, energy) * isotropic),
     ]
