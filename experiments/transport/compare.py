@@ -1,10 +1,11 @@
-"""Counts of a detector behind slabs and in boxes: the model that missions use against the Monte Carlo.
+"""Counts of a detector behind slabs: the model that missions use against the Monte Carlo.
 
     python -m experiments.transport.compare [--photons N] [--out FOLDER]
 
 writes ``slabs.csv`` and ``slabs.png``. On two cores give fewer photons.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -19,8 +20,10 @@ from experiments.transport.walk import Floats, medium, slab
 from swarmsim.config.load import load_named
 from swarmsim.config.radiation import Detector as DetectorSpec
 from swarmsim.config.radiation import DetectorMount, Line, Nuclide
-from swarmsim.radiation import Detector, Library, Source, build_detector, line_rates, load_library
+from swarmsim.pytree import on_device
+from swarmsim.radiation import Detector, Library, build_detector, load_library
 from swarmsim.radiation.attenuation import linear_attenuation
+from swarmsim.radiation.rate import transmission
 from swarmsim.radiation.response import build_response
 from swarmsim.site import Crossed
 
@@ -98,7 +101,7 @@ def cases(name: str, photons: int) -> list[Case]:
                     jax.random.key(7), tables, jnp.float32(energy), jnp.float32(thickness),
                     *(jnp.float32(g) for g in gaps), photons,
                 )  # fmt: skip
-                direct, scattered = modelled(detector, number, library.material_index(material_name), thickness, place)
+                direct, scattered = modelled(detector, number, {material_name: (thickness, place)})
                 found.append(
                     Case(material_name, thickness, energy, place, uncollided, uncollided + float(tally.total),
                          float(tally.error), direct + scattered, direct)
@@ -106,16 +109,19 @@ def cases(name: str, photons: int) -> list[Case]:
     return found
 
 
-def modelled(detector: Detector, number: int, material: int, thickness: float, place: float) -> tuple[float, float]:
-    """Unscattered and scattered counts over those of the bare source."""
+def modelled(detector: Detector, number: int, crossed: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
+    """Unscattered and scattered counts of the line ``number`` over those of the bare source.
+
+    ``crossed`` has the length in m and the place along the way, from 0 to 1, of each material.
+    """
     materials = len(detector.material_names)
-    source = Source(position_m=jnp.zeros(3), activity_bq=jnp.float32(1e9), nuclide=jnp.int32(number))
-    where, up = jnp.array([WAY_M, 0.0, 0.0]), jnp.array([0.0, 0.0, 1.0])
-    bare = Crossed(length_m=jnp.zeros(materials), place=jnp.full(materials, 0.5))
-    way = Crossed(length_m=bare.length_m.at[material].set(thickness), place=bare.place.at[material].set(place))
-    free = float(jnp.sum(line_rates(detector, source, bare, where, up)[0]))
-    direct, scattered = line_rates(detector, source, way, where, up)
-    return float(jnp.sum(direct)) / free, float(jnp.sum(scattered)) / free
+    length, place = np.zeros(materials), np.full(materials, 0.5)
+    for name, (metres, share) in crossed.items():
+        index = detector.material_names.index(name)
+        length[index], place[index] = metres, share
+    way = Crossed(length_m=on_device(length), place=on_device(place))
+    direct, scattered = transmission(detector, jnp.int32(number), way)
+    return float(direct[0]), float(scattered[0])
 
 
 def draw(found: list[Case], file: Path) -> None:

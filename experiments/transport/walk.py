@@ -18,18 +18,12 @@ from numpy.typing import NDArray
 
 from swarmsim.config.radiation import Material
 from swarmsim.radiation.elements import CUT_KEV, ELECTRON_KEV
-from swarmsim.radiation.interactions import (
-    KEV_ANGSTROM,
-    Interactions,
-    form_factor_squared,
-    interactions,
-)
+from swarmsim.radiation.interactions import coherent_density, interactions, klein_nishina, scattered_fraction
 from swarmsim.radiation.scattering import BINS
 
 Floats = NDArray[np.float64]
 
 COLLISIONS = 60
-_MOLIERE_A, _MOLIERE_B = (0.1, 0.55, 0.35), (6.0, 1.2, 0.3)
 
 
 class Medium(NamedTuple):
@@ -80,25 +74,17 @@ def medium(material: Material, energy_kev: float, response: Callable[[Floats], F
         lines=f32(np.array([(s.alpha_kev, s.beta_kev, s.alpha_share) for s in table.shells]).reshape(-1, 3)),
         compton_cosine=f32(table.compton_cosine),
         coherent_cosine=f32(table.coherent_cosine),
-        compton_norm=f32([np.trapezoid(_kn(e, cosine), cosine) for e in energy]),
-        coherent_norm=f32([np.trapezoid(_rayleigh(table, e, cosine), cosine) for e in energy]),
+        compton_norm=f32([np.trapezoid(klein_nishina(e, cosine), cosine) for e in energy]),
+        coherent_norm=f32(
+            [np.trapezoid(coherent_density(e, cosine, table.weights, table.screening), cosine) for e in energy]
+        ),
         weights=f32(table.weights),
         screening=f32(table.screening),
         response=f32(np.ones_like(energy) if response is None else response(energy) / response(np.array([energy_kev]))),
     )
 
 
-def _kn(energy: float, cosine: np.ndarray) -> np.ndarray:
-    ratio = 1.0 / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
-    return 0.5 * ratio**2 * (ratio + 1.0 / ratio - 1.0 + cosine**2)
-
-
-def _rayleigh(table: Interactions, energy: float, cosine: np.ndarray) -> np.ndarray:
-    transfer = 4.0 * np.pi * energy / KEV_ANGSTROM * np.sqrt(0.5 * (1.0 - cosine))
-    return form_factor_squared(transfer, table.weights, table.screening) * (1.0 + cosine**2)
-
-
-def _at(m: Medium, values: jax.Array, energy: jax.Array) -> jax.Array:
+def at(m: Medium, values: jax.Array, energy: jax.Array) -> jax.Array:
     """A table [g] or [g, k] at energies [n]."""
     place = jnp.clip((jnp.log(energy) - m.first) / m.step, 0.0, values.shape[0] - 1.001)
     row = place.astype(jnp.int32)
@@ -128,7 +114,8 @@ def _turned(direction: jax.Array, cosine: jax.Array, azimuth: jax.Array) -> jax.
     return new / jnp.linalg.norm(new, axis=1, keepdims=True)
 
 
-def _isotropic(key: jax.Array, n: int) -> jax.Array:
+def isotropic(key: jax.Array, n: int) -> jax.Array:
+    """Unit vectors [n, 3] in all directions alike."""
     vector = jax.random.normal(key, (n, 3))
     return vector / jnp.linalg.norm(vector, axis=1, keepdims=True)
 
@@ -140,15 +127,15 @@ def collide(
     n = energy.shape[0]
     keys = jax.random.split(key, 5)
     u, v, w, azimuth = jax.random.uniform(keys[0], (4, n))
-    coherent, compton, pair = (_at(m, t, energy) for t in (m.coherent, m.compton, m.pair))
-    shells = _at(m, m.fluorescence, energy)
+    coherent, compton, pair = (at(m, t, energy) for t in (m.coherent, m.compton, m.pair))
+    shells = at(m, m.fluorescence, energy)
     left = coherent + compton + pair + jnp.sum(shells, axis=1)
     choice = jax.random.uniform(keys[1], (n,)) * left
     is_coherent, is_compton = choice < coherent, (choice >= coherent) & (choice < coherent + compton)
     is_pair = (choice >= coherent + compton) & (choice < coherent + compton + pair)
     cosine = _drawn(m, m.compton_cosine, energy, u, v)
     cosine = jnp.where(is_coherent, _drawn(m, m.coherent_cosine, energy, u, v), cosine)
-    scattered = energy / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
+    scattered = energy * scattered_fraction(energy, cosine)
     new = jnp.where(is_coherent, energy, jnp.where(is_compton, scattered, jnp.where(is_pair, ELECTRON_KEV, 0.0)))
     if m.lines.shape[0]:
         ends = coherent + compton + pair
@@ -157,7 +144,7 @@ def collide(
             line = jnp.where(w < m.lines[k, 2], m.lines[k, 0], m.lines[k, 1])
             new, ends = jnp.where(chosen, line, new), ends + shells[:, k]
     deflected = _turned(direction, cosine, 2.0 * jnp.pi * azimuth)
-    turned = jnp.where((is_coherent | is_compton)[:, None], deflected, _isotropic(keys[2], n))
+    turned = jnp.where((is_coherent | is_compton)[:, None], deflected, isotropic(keys[2], n))
     weight = weight * left * jnp.where(is_pair, 2.0, 1.0) * (new > CUT_KEV)
     return jnp.maximum(new, CUT_KEV), weight, turned
 
@@ -174,25 +161,20 @@ def _result(spectrum: jax.Array, each: jax.Array) -> Tally:
     return Tally(spectrum / n, jnp.mean(each), jnp.std(each) / jnp.sqrt(n))
 
 
-def _next_events(
+def next_events(
     m: Medium, energy: jax.Array, direction: jax.Array, toward: jax.Array
 ) -> tuple[tuple[jax.Array, jax.Array], ...]:
     """Energy [n] after, and density [n] per steradian of, each kind of interaction that sends a photon ``toward``."""
     cosine = jnp.clip(jnp.sum(direction * toward, axis=1), -1.0, 1.0)
-    ratio = 1.0 / (1.0 + energy / ELECTRON_KEV * (1.0 - cosine))
-    kn = 0.5 * ratio**2 * (ratio + 1.0 / ratio - 1.0 + cosine**2) / _at(m, m.compton_norm, energy)
-    transfer = 4.0 * jnp.pi * energy / KEV_ANGSTROM * jnp.sqrt(0.5 * (1.0 - cosine))
-    factor = 0.0
-    for a, b in zip(_MOLIERE_A, _MOLIERE_B, strict=True):
-        factor = factor + a / (1.0 + (transfer[:, None] * m.screening / b) ** 2)
-    rayleigh = (factor**2 @ m.weights) * (1.0 + cosine**2) / _at(m, m.coherent_norm, energy)
+    kn = klein_nishina(energy, cosine) / at(m, m.compton_norm, energy)
+    rayleigh = coherent_density(energy, cosine, m.weights, m.screening) / at(m, m.coherent_norm, energy)
     per_steradian, isotropic = 1.0 / (2.0 * jnp.pi), 1.0 / (4.0 * jnp.pi)
     events = [
-        (energy * ratio, _at(m, m.compton, energy) * kn * per_steradian),
-        (energy, _at(m, m.coherent, energy) * rayleigh * per_steradian),
-        (jnp.full_like(energy, ELECTRON_KEV), 2.0 * _at(m, m.pair, energy) * isotropic),
+        (energy * scattered_fraction(energy, cosine), at(m, m.compton, energy) * kn * per_steradian),
+        (energy, at(m, m.coherent, energy) * rayleigh * per_steradian),
+        (jnp.full_like(energy, ELECTRON_KEV), 2.0 * at(m, m.pair, energy) * isotropic),
     ]
-    shells = _at(m, m.fluorescence, energy)
+    shells = at(m, m.fluorescence, energy)
     for k in range(m.lines.shape[0]):
         for column, share in ((0, m.lines[k, 2]), (1, 1.0 - m.lines[k, 2])):
             events.append((jnp.full_like(energy, m.lines[k, column]), shells[:, k] * share * isotropic))
@@ -223,7 +205,7 @@ def slab(
     def body(i: int, s: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         place, direction, energy, weight, spectrum, each = s
         k1, k2 = jax.random.split(jax.random.fold_in(keys[2], i))
-        mu, along = _at(m, m.attenuation_1_m, energy), direction[:, 0]
+        mu, along = at(m, m.attenuation_1_m, energy), direction[:, 0]
         ahead = jnp.where(along > 0.0, thickness_m - place[:, 0], place[:, 0])
         length = jnp.minimum(ahead / jnp.maximum(jnp.abs(along), 1e-9), 1e6)
         inside = -jnp.expm1(-mu * length)
@@ -234,9 +216,9 @@ def slab(
         far = jnp.linalg.norm(gap, axis=1)
         toward = gap / far[:, None]
         left = (thickness_m - place[:, 0]) / toward[:, 0]
-        for after, density in _next_events(m, energy, direction, toward):
-            kept = jnp.exp(-_at(m, m.attenuation_1_m, jnp.maximum(after, CUT_KEV)) * left) * (after > CUT_KEV)
-            score = weight * density * kept * _at(m, m.response, jnp.maximum(after, CUT_KEV)) / far**2 / bare
+        for after, density in next_events(m, energy, direction, toward):
+            kept = jnp.exp(-at(m, m.attenuation_1_m, jnp.maximum(after, CUT_KEV)) * left) * (after > CUT_KEV)
+            score = weight * density * kept * at(m, m.response, jnp.maximum(after, CUT_KEV)) / far**2 / bare
             spectrum, each = spectrum + _spectrum(after, score, energy_kev), each + score
         energy, weight, direction = collide(k2, m, energy, weight, direction)
         return place, direction, energy, weight, spectrum, each
@@ -260,15 +242,15 @@ def shell(
     """Point source in the middle of a spherical shell, detector at ``distance_m`` from it, outside."""
     keys = jax.random.split(key, 2)
     n, outer_m = photons, inner_m + thickness_m
-    direction = _isotropic(keys[0], n)
+    direction = isotropic(keys[0], n)
 
     def body(i: int, s: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         place, direction, energy, weight, spectrum, each = s
         k1, k2 = jax.random.split(jax.random.fold_in(keys[1], i))
-        mu = _at(m, m.attenuation_1_m, energy)
-        first, empty, second = _chords(place, direction, inner_m, outer_m)
+        mu = at(m, m.attenuation_1_m, energy)
+        first, empty, second = chords(place, direction, inner_m, outer_m)
         whole = first + second
-        leaves = weight * jnp.exp(-mu * whole) * _at(m, m.response, energy)
+        leaves = weight * jnp.exp(-mu * whole) * at(m, m.response, energy)
         # at the detector's sphere the photon crosses at an angle: flux = crossings / cosine
         across = jnp.linalg.norm(jnp.cross(place, direction), axis=1) / distance_m
         score = jnp.where(i > 0, leaves / jnp.sqrt(jnp.maximum(1.0 - across**2, 1e-6)), 0.0)
@@ -285,7 +267,7 @@ def shell(
     return _result(spectrum, each)
 
 
-def _chords(
+def chords(
     place: jax.Array, direction: jax.Array, inner_m: jax.Array, outer_m: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Lengths [n] along rays in the shell before the cavity, in the cavity, and after it."""
@@ -317,11 +299,11 @@ def infinite(
     def body(i: int, s: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         place, direction, energy, weight, tracks = s
         k1, k2 = jax.random.split(jax.random.fold_in(keys[1], i))
-        mu = _at(m, m.attenuation_1_m, energy)
+        mu = at(m, m.attenuation_1_m, energy)
         along = jnp.sum(place * direction, axis=1)[:, None]
         root = jnp.sqrt(jnp.maximum(along**2 - jnp.sum(place**2, axis=1)[:, None] + edges_m**2, 0.0))
         enter, leave = jnp.maximum(-along - root, 0.0), jnp.maximum(-along + root, 0.0)
-        weighed = weight * _at(m, m.response, energy)
+        weighed = weight * at(m, m.response, energy)
         track = weighed[:, None] * (jnp.exp(-mu[:, None] * enter) - jnp.exp(-mu[:, None] * leave)) / mu[:, None]
         number = jnp.floor(BINS * jnp.log(energy / CUT_KEV) / jnp.log(energy_kev / CUT_KEV))
         chosen = jnp.clip(number, 0, BINS - 1)[:, None] == jnp.arange(BINS)
@@ -331,10 +313,10 @@ def infinite(
         return place, direction, energy, weight, tracks
 
     start = (
-        jnp.zeros((n, 3)), _isotropic(keys[0], n), jnp.full(n, energy_kev), jnp.ones(n), jnp.zeros((edges, BINS)),
+        jnp.zeros((n, 3)), isotropic(keys[0], n), jnp.full(n, energy_kev), jnp.ones(n), jnp.zeros((edges, BINS)),
     )  # fmt: skip
     *_, tracks = jax.lax.fori_loop(0, collisions, body, start)
-    mu = _at(m, m.attenuation_1_m, energy_kev[None])[0]
+    mu = at(m, m.attenuation_1_m, energy_kev[None])[0]
     unscattered = (jnp.exp(-mu * edges_m[:-1]) - jnp.exp(-mu * edges_m[1:])) / mu
     spectrum = jnp.diff(tracks, axis=0) / n / unscattered[:, None]
     return jnp.sum(spectrum, axis=1), spectrum

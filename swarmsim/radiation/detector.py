@@ -194,30 +194,20 @@ def _transport(
     library: Library, energy: Floats, kind: str, counting: _Counting, size: tuple[float, float]
 ) -> tuple[Floats, Floats, Floats]:
     """The fields attenuation_1_m, scatter_1_m and scattered_bins of a detector."""
-    flat, back = np.unique(energy, return_inverse=True)
-    materials, k = library.materials, len(flat)
-    attenuation = np.zeros((k, len(materials)))
-    scatter = np.zeros((len(scattering.POSITIONS), scattering.COEFFICIENTS, k, len(materials)))
-    bins = np.zeros((len(SPECTRUM_DEPTHS), len(materials), k, SPECTRUM_BINS))
-    if kind == "physical":
-        energies = scattering.bin_energies(flat)
-        counted = _mean_area(counting, energies, size) / _mean_area(counting, flat, size)[:, None]
-    for m, material in enumerate(materials):
-        if kind == "paper_ideal":
-            attenuation[:, m] = 0.0 if material.name == AIR else linear_attenuation(material, flat)
-            continue
-        attenuation[:, m] = linear_attenuation(material, flat)
-        counts = scattering.scattered_photons(material, flat) * counted[:, None, None, :]
-        fits = scattering.fitted(counts.sum(axis=-1))  # [k, positions, COEFFICIENTS]
-        scatter[..., m] = np.moveaxis(fits, 0, -1) * attenuation[:, m]
-        bins[:, m] = _energy_shares(counts[:, :, 0], energies)
-    shape = energy.shape
-    by_nuclide = back.reshape(shape)
-    return (
-        attenuation[by_nuclide],
-        np.moveaxis(scatter[:, :, by_nuclide], 2, 0),
-        np.moveaxis(bins[:, :, by_nuclide], 2, 0),
+    physical = kind == "physical"
+    tables = scattering.transport(
+        library.materials, energy, (lambda e: _mean_area(counting, e, size)) if physical else None
     )
+    attenuation, row = tables.attenuation_1_m, tables.row
+    bins = np.zeros((len(tables.energy_kev), len(SPECTRUM_DEPTHS), len(library.materials), SPECTRUM_BINS))
+    if physical:
+        energies = scattering.bin_energies(tables.energy_kev)
+        for m in range(len(library.materials)):
+            bins[:, :, m] = np.moveaxis(_energy_shares(tables.counts[:, m, :, 0], energies), 1, 0)
+    else:
+        attenuation = attenuation * [material.name != AIR for material in library.materials]
+    # from [N, L, ...] to the places of the lines in the fields
+    return attenuation[row], np.moveaxis(tables.scatter_1_m[row], 1, 3), np.moveaxis(bins[row], 1, 3)
 
 
 def _mean_area(counting: _Counting, energy: Floats, size: tuple[float, float]) -> Floats:

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from swarmsim.pytree import on_device
 from swarmsim.radiation import scattering
-from swarmsim.radiation.attenuation import linear_attenuation
 from swarmsim.radiation.cylinder import NEAR_COLUMNS, NEAR_ROWS, NEAR_TABLES
 from swarmsim.radiation.detector import SPECTRUM_BINS, Detector, lines_of
 from swarmsim.radiation.library import Library
@@ -38,15 +37,7 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
     It has no background, no dead time and no spectrum.
     """
     energy, yields = lines_of(library)
-    flat, back = np.unique(energy, return_inverse=True)
-    by_nuclide = back.reshape(energy.shape)
-    shape = (len(scattering.POSITIONS), scattering.COEFFICIENTS, len(flat), len(library.materials))
-    attenuation, scatter = np.zeros((len(flat), len(library.materials))), np.zeros(shape)
-    weight = per_fluence(quantity, scattering.bin_energies(flat)) / per_fluence(quantity, flat)[:, None]
-    for m, material in enumerate(library.materials):
-        attenuation[:, m] = linear_attenuation(material, flat)
-        dose = np.sum(scattering.scattered_photons(material, flat) * weight[:, None, None, :], axis=-1)
-        scatter[..., m] = np.moveaxis(scattering.fitted(dose), 0, -1) * attenuation[:, m]
+    tables = scattering.transport(library.materials, energy, lambda e: per_fluence(quantity, e))
     area = np.zeros((*energy.shape, 5))
     area[..., 0] = per_fluence(quantity, energy) * 1e-4 * MICRO_PER_HOUR
     f32, zero = on_device, on_device(0.0)
@@ -67,8 +58,8 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
         effective_area_m2=f32(area),
         near=f32(np.ones((NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS))),
         near_share=f32(np.full((*energy.shape, NEAR_TABLES), 1 / NEAR_TABLES)),
-        attenuation_1_m=f32(attenuation[by_nuclide]),
-        scatter_1_m=f32(np.moveaxis(scatter[:, :, by_nuclide], 2, 0)),
+        attenuation_1_m=f32(tables.attenuation_1_m[tables.row]),
+        scatter_1_m=f32(np.moveaxis(tables.scatter_1_m[tables.row], 1, 3)),
         peak_spectrum=f32(np.ones((*energy.shape, 1))),
         scattered_bins=f32(bins),
         peak_rois=f32(np.ones((*energy.shape, 1))),

@@ -7,37 +7,59 @@ two photons of 511 keV where it happens; photoelectric absorption above a K edge
 """
 
 from dataclasses import dataclass
+from typing import TypeVar, cast
 
+import jax
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from swarmsim.config.radiation import Material
 from swarmsim.radiation.attenuation import coefficients
 from swarmsim.radiation.elements import ELECTRON_KEV, Element, KShell, elements
 
 Floats = NDArray[np.float64]
+Array = TypeVar("Array", Floats, jax.Array)
+"""Cross sections are written once for the host and for the Monte Carlo on the device."""
 
 KEV_ANGSTROM = 12.398420  # h c
 QUANTILES = 129
-_MOLIERE_A, _MOLIERE_B = (
-    np.array([0.1, 0.55, 0.35]),
-    np.array([6.0, 1.2, 0.3]),
-)  # Molière, Z. Naturforsch. 2a, 1947, 133
+_MOLIERE = ((0.1, 6.0), (0.55, 1.2), (0.35, 0.3))  # amplitude and scale: Molière, Z. Naturforsch. 2a, 1947, 133
 _BOHR_ANGSTROM = 0.529177
 
 
-def scattered_fraction(energy_kev: ArrayLike, cosine: ArrayLike) -> Floats:
+def scattered_fraction(energy_kev: Array | float, cosine: Array | float) -> Array:
     """Energy [...] of a Compton photon over that of the incident one: 1 / (1 + E (1 - cos) / 511 keV)."""
-    return np.asarray(1.0 / (1.0 + np.asarray(energy_kev) / ELECTRON_KEV * (1.0 - np.asarray(cosine))))
+    return cast(Array, 1.0 / (1.0 + energy_kev / ELECTRON_KEV * (1.0 - cosine)))
 
 
-def klein_nishina(energy_kev: ArrayLike, cosine: ArrayLike) -> Floats:
+def klein_nishina(energy_kev: Array | float, cosine: Array) -> Array:
     """Differential Klein-Nishina cross section per unit cosine, in units of 2 pi r_e^2: it integrates to 4/3 at E = 0.
 
     Knoll, Radiation Detection and Measurement, 4th ed., section 2.III.
     """
-    ratio = scattered_fraction(energy_kev, cosine)
-    return 0.5 * ratio**2 * (ratio + 1.0 / ratio - 1.0 + np.asarray(cosine) ** 2)
+    ratio: Array = scattered_fraction(energy_kev, cosine)
+    return cast(Array, 0.5 * ratio**2 * (ratio + 1.0 / ratio - 1.0 + cosine**2))
+
+
+def coherent_density(energy_kev: Array | float, cosine: Array, weights: Array, screening: Array) -> Array:
+    """Coherent scattering per unit cosine [...], not normalised: Thomson's cross section times the squared form factor.
+
+    ``weights`` [n] and ``screening`` [n] are those of `Interactions`.
+    """
+    squared = (4.0 * np.pi * energy_kev / KEV_ANGSTROM) ** 2 * (0.5 * (1.0 - cosine))
+    return cast(Array, form_factor_squared(squared, weights, screening) * (1.0 + cosine**2))
+
+
+def form_factor_squared(transfer_squared_1_a2: Array, weights: Array, screening: Array) -> Array:
+    """Squared form factor [...] of the mixture over its value in the forward direction.
+
+    ``transfer_squared_1_a2`` [...] is the squared momentum transfer (q / hbar)^2 in 1/angstrom^2; of each element
+    (f / Z)^2 with f / Z = sum a_i / (1 + (q R / b_i)^2), R the Thomas-Fermi radius (Molière's fit of its screening
+    function).
+    """
+    scaled = transfer_squared_1_a2[..., None] * screening**2
+    factor = sum(a / (1.0 + scaled / b**2) for a, b in _MOLIERE)
+    return cast(Array, factor**2 @ weights)
 
 
 @dataclass(frozen=True)
@@ -94,17 +116,6 @@ def _k_photons(material: Material, element: Element, shell: KShell, energy: Floa
     return np.where(energy > shell.edge_kev, own * shell.photons, 0.0)
 
 
-def form_factor_squared(transfer_1_a: Floats, weights: Floats, screening: Floats) -> Floats:
-    """Squared form factor [...] of the mixture over its value in the forward direction.
-
-    ``transfer_1_a`` [...] is the momentum transfer q / hbar in 1/angstrom; of each element (f / Z)^2 with
-    f / Z = sum a_i / (1 + (q R / b_i)^2), R the Thomas-Fermi radius (Molière's fit of its screening function).
-    """
-    scaled = (transfer_1_a[..., None, None] * screening[:, None] / _MOLIERE_B) ** 2
-    factor = np.sum(_MOLIERE_A / (1.0 + scaled), axis=-1)
-    return np.asarray(factor**2 @ weights)
-
-
 def _quantiles(cosine: Floats, density: Floats) -> Floats:
     """Quantiles [g, QUANTILES] of distributions ``density`` [g, c] over ``cosine`` [g, c]."""
     step = np.diff(cosine, axis=1)
@@ -122,6 +133,5 @@ def _compton_quantiles(energy: Floats) -> Floats:
 def _coherent_quantiles(energy: Floats, weights: Floats, screening: Floats) -> Floats:
     # fine in the forward direction, where nearly all coherent photons go
     cosine = 1.0 - 2.0 * np.concatenate([[0.0], np.geomspace(1e-8, 1.0, 600)])[::-1]
-    transfer = 4.0 * np.pi * energy[:, None] / KEV_ANGSTROM * np.sqrt(0.5 * (1.0 - cosine))
-    density = form_factor_squared(transfer, weights, screening) * (1.0 + cosine**2)
+    density = coherent_density(energy[:, None], cosine, weights, screening)
     return _quantiles(np.broadcast_to(cosine, density.shape), density)

@@ -10,6 +10,7 @@ The device evaluates, for each line, log(scattered counts / counts of the bare s
 c2 log(1 + t / 0.2) + c3 log(1 + t / 3), t the optical depth: within 3 % of the table's total up to 8 mean free paths.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import groupby
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from swarmsim.config.files import packaged_dir
 from swarmsim.config.radiation import Material
-from swarmsim.radiation.attenuation import coefficients
+from swarmsim.radiation.attenuation import coefficients, linear_attenuation
 from swarmsim.radiation.elements import CUT_KEV
 
 Floats = NDArray[np.float64]
@@ -45,6 +46,17 @@ class _Table:
     energy_kev: Floats  # [e]
     depth: Floats  # [d]
     photons: Floats  # [e, d, positions, BINS]
+
+
+@dataclass(frozen=True)
+class Transport:
+    """What a counter's lines meet in each material (M), for the k energies that differ among the lines."""
+
+    energy_kev: Floats  # [k]
+    row: NDArray[np.intp]  # [N, L] of each line
+    attenuation_1_m: Floats  # [k, M]
+    scatter_1_m: Floats  # [k, positions, COEFFICIENTS, M] attenuation times coefficients of scattered counts
+    counts: Floats  # [k, M, d, positions, BINS] scattered counts over those of the bare source
 
 
 @lru_cache(maxsize=1)
@@ -105,6 +117,26 @@ def scattered_photons(material: Material, energy_kev: Floats) -> Floats:
         photons = table.photons[:, :, : len(POSITIONS)]
         total += weight * ((1 - part) * photons[row] + part * photons[row + 1])
     return total
+
+
+def transport(
+    materials: Sequence[Material], energy_kev: Floats, counted: Callable[[Floats], Floats] | None
+) -> Transport:
+    """Tables of the lines ``energy_kev`` [N, L] behind each of ``materials``.
+
+    ``counted`` gives counts per photon, up to a factor, for energies [...]; with None no scattered photon counts.
+    Raises `InputError` for a line outside the table of cross sections.
+    """
+    flat, row = np.unique(energy_kev, return_inverse=True)
+    attenuation = np.stack([linear_attenuation(material, flat) for material in materials], axis=1)
+    shape = (len(flat), len(POSITIONS), COEFFICIENTS, len(materials))
+    scatter, counts = np.zeros(shape), np.zeros((len(flat), len(materials), len(depths()), len(POSITIONS), BINS))
+    if counted is not None:
+        weight = counted(bin_energies(flat)) / counted(flat)[:, None]
+        for m, material in enumerate(materials):
+            counts[:, m] = scattered_photons(material, flat) * weight[:, None, None, :]
+            scatter[..., m] = fitted(counts[:, m].sum(axis=-1)) * attenuation[:, m, None, None]
+    return Transport(flat, row.reshape(energy_kev.shape), attenuation, scatter, counts)
 
 
 def fitted(scattered: Floats) -> Floats:

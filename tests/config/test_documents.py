@@ -1,5 +1,6 @@
 """Reading YAML: scalars of the YAML 1.2 core schema, the lines of values, and writing back."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmsim.config.documents import Mark, dump_yaml, parse_value, read_file, read_text
+from swarmsim.config import documents
+from swarmsim.config.documents import Document, Mark, dump_yaml, parse_value, read_file, read_text
+from swarmsim.config.errors import InputError
+from tests.config.mutations import make_mutant
 
 
 @pytest.mark.parametrize(
@@ -73,3 +77,33 @@ tricky = st.sampled_from(["1e3", "010", "yes", "~", "null", "0x1", "1:30", ".5",
 @given(st.dictionaries(st.text("abc", min_size=1), values | tricky, min_size=1, max_size=4))
 def test_what_is_written_is_read_back(data: dict[str, Any]) -> None:
     assert read_text(dump_yaml(data), "f").data == data
+
+
+def test_a_large_document_is_read_quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = "vehicles:\n" + "".join(f"- {{name: u{i}, type: x500, position_m: [{i}.5, 0]}}\n" for i in range(2500))
+
+    def read() -> tuple[Document, float]:
+        started = time.process_time()
+        return read_text(text, "f"), time.process_time() - started
+
+    quick, quick_s = read()
+    monkeypatch.setattr(documents, "_FastLoader", documents._Loader)
+    slow, slow_s = read()
+    assert quick == slow
+    assert quick_s < 0.5 * slow_s
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_both_parsers_say_the_same(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """The quick one decides what is right, the other one what is wrong; tabs between words only the quick one takes."""
+    text = make_mutant(seed).content.decode("utf-8", "replace").replace("\t", " ")
+
+    def read() -> Document | str:
+        try:
+            return read_text(text, "f")
+        except InputError as error:
+            return str(error)
+
+    quick = read()
+    monkeypatch.setattr(documents, "_FastLoader", documents._Loader)
+    assert quick == read()

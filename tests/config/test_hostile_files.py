@@ -16,6 +16,15 @@ FORMATION = "[{{name: v, type: tarot_t650, position_m: {}, formation: {{count: 2
 FILES = {
     "a number of 5000 digits": ("name: x\nseed: " + "9" * 5000, "more than 18 digits"),
     "a list of 100,000": ("sources: [" + "1, " * 100_000 + "]", "too many values"),
+    "a fault after 29,000 values": ("x: [" + "1," * 29_000 + "\n}\n", "is not valid YAML"),
+    "a field of 29,000 words": (
+        f"extends: recon\nphases: [{{name: a, policy: hold, who: [{', '.join(f'q{i}' for i in range(29_000))}]}}]",
+        "this field is missing",
+    ),
+    "3,000 unknown types": (
+        f"extends: recon\nvehicles: [{', '.join(f'{{name: u{i}, type: t{i}, x: [1, 2]}}' for i in range(3000))}]",
+        "there are more problems",
+    ),
     "brackets": ("x: " + "[" * 100_000, "nested too deeply"),
     "laughs": (LAUGHS, "too many values"),
     "fifty megabytes": ("#" * 50_000_000, "too large for a configuration file"),
