@@ -2,10 +2,10 @@
 
 The hypotheses: background only; one nuclide; two or three nuclides; something that the library does not hold, which is
 any non-negative sum of lines of the detector's own shape. Under each, the spectrum is a non-negative sum of templates:
-the background (amplitude and tilt free), and for each nuclide its spectrum bare and behind concrete, steel and lead.
-Gain and resolution are profiled over a grid. The fits maximise the Poisson likelihood by expectation maximisation.
-All nuclides are fitted alone, the best of them at all resolutions; each other is added to the best two, and a third to
-the best pair.
+the background (amplitude and tilt free), and for each nuclide its spectrum bare, in air, and behind concrete, steel and
+lead (`swarmsim.radiation.templates`). All nuclides are fitted alone; each other is added to the best two, and a third
+to the best pair. The best of each number are fitted at a gain and a resolution of their own
+(`swarmsim.radiation.fits`): those of one nuclide that is fitted to a mixture are not those of the mixture.
 Posterior = likelihood x Occam factor of each source's strength x prior, where each bin's deviance is reduced to account
 for the error of the templates. Free lines fit better than the truth does, by about a chi-squared number whose degrees
 of freedom grow with the lines that the resolution separates; they are charged for it.
@@ -40,20 +40,23 @@ from swarmsim.radiation.templates import NATURAL, Templates, rebinned, templates
 
 NONE, UNKNOWN = -1, -2
 """What `Identification.nuclide` is where no nuclide is named: background only, or a source not in the library."""
-_COARSE = 2  # every so many gains all nuclides are fitted, the best ones then at the gains between
+_COARSE = 2  # every so many gains of the tables all nuclides are fitted
 _FREE_GAINS = (2, 6, 10)  # of GAINS, at which free lines are fitted: their energies are free anyway
-CANDIDATES = 5  # best single nuclides, which are fitted at other gains and resolutions
+CANDIDATES = 5  # best single nuclides, which are fitted to the end
 REFINED = 4  # best mixtures, which are fitted to the end
 FIRSTS = 2  # best single nuclides to which each other is added
 # Prior: a hotspot may be natural background, may be no nuclide of the library, and is rarely a mixture.
 _PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.1, 0.4, 0.08, 0.02
 _SHAPE_ERROR = 0.04  # relative error of a nuclide's whole shape, which free lines do not have: an estimate
-_FREE = ((120, 48.0),)
-"""Iterations of a fit of free lines, and by how much its deviance is smaller than that of the true nuclide: mean over
-random spectra of the library on a grid of `_FREE_GRID` lines. Few iterations fit the noise less, and more are needed
-where there are many counts."""
-_FREE_GRID = 110
-_FREE_SIGMAS = 1.5  # by so many standard deviations (chi-squared) must it be smaller than that
+_FREE_ITERATIONS = 120
+_FREE_MEAN, _FREE_GRID = 48.0, 110
+"""By how much the deviance of free lines is smaller than that of the true nuclide, on a grid of so many lines: mean
+over random spectra of 300 and 1000 counts of the library behind walls. Its spread there is that of chi-squared."""
+_FREE_SIGMAS = 1.75  # by so many standard deviations must it be smaller than that: one in 25 is, by chance
+_MODEL_ERROR = 0.015
+"""Relative error of an expected spectrum in a bin, for the goodness of fit. Sums of the templates differ from spectra
+behind random walls by 4 to 5 % of the source's counts (root mean square over nuclides), a third of which it is of all
+counts where the background is twice the source."""
 
 
 @pytree
@@ -112,7 +115,7 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
         strength_cps=jnp.sum(best.weights, axis=1) / jnp.maximum(live_s, 1e-3),
         gain=best.gain,
         width=best.width,
-        goodness=p_value(data.counts, expected, data.certainty, fitted),
+        goodness=p_value(data.counts, expected, data.certainty, fitted, _MODEL_ERROR),
         fit=_in_channels(detector, fine, best),
     )
 
@@ -162,17 +165,14 @@ def _free_lines(binned: Binned, data: Data) -> jax.Array:
     some = np.array(_FREE_GAINS)
     natural = binned.background[some, WIDTHS.index(1.0)]
     shape = jnp.concatenate([natural, binned.lines[some]], axis=1)
-    scores = []
-    for iterations, mean in _FREE:
-        weights = maximise(shape, data, iterations)
-        losses = loss(shape, weights, data)
-        best = jnp.argmin(losses)
-        sources = weights[best, None, NATURAL:]
-        occam = log_occam(shape[best, None, NATURAL:], sources, data, weights[best] @ shape[best])[0]
-        freedom = mean * binned.lines.shape[1] / _FREE_GRID
-        charge = freedom + _FREE_SIGMAS * math.sqrt(2.0 * freedom) + _SHAPE_ERROR**2 * jnp.sum(sources)
-        scores.append(occam - 0.5 * (losses[best] + charge))
-    return jnp.max(jnp.stack(scores))
+    weights = maximise(shape, data, _FREE_ITERATIONS)
+    losses = loss(shape, weights, data)
+    best = jnp.argmin(losses)
+    sources = weights[best, None, NATURAL:]
+    occam = log_occam(shape[best, None, NATURAL:], sources, data, weights[best] @ shape[best])[0]
+    freedom = _FREE_MEAN * binned.lines.shape[1] / _FREE_GRID
+    charge = freedom + _FREE_SIGMAS * math.sqrt(2.0 * freedom) + _SHAPE_ERROR**2 * jnp.sum(sources)
+    return occam - 0.5 * (losses[best] + charge)
 
 
 def _in_channels(detector: Detector, fine: Templates, best: Fits) -> jax.Array:
