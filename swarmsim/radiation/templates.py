@@ -17,12 +17,15 @@ from swarmsim.radiation.rate import scattered_shares, transmission
 from swarmsim.site.rays import Crossed
 
 SHIELDS = ("concrete", "steel", "lead")
-DEPTHS = (1.3, 3.6)
-"""Optical depths of the shields of the templates; sums of them and of the bare spectrum cover 0 to 4."""
-AIR_DEPTH = 0.5
-"""Optical depth of the air of a template: metres of it scatter a tenth of the photons of 60 keV."""
+DEPTHS = (0.3, 1.3, 4.0)
+"""Optical depths of the shields of the templates; sums of them and of the bare spectrum cover 0 to 4. The least stops
+the X-rays and little else."""
+AIR_M = (30.0, 100.0)
+"""Lengths of the ways in air of the templates; the longest is also that of templates behind the deepest shields."""
 TILT = 0.2
 """Relative change of the background's shape at both ends of the energies in its two templates."""
+NATURAL = 2
+"""Templates of the background."""
 _TILT_KEV = (30.0, 3000.0)
 _SEARCH_STEPS = 40
 
@@ -39,19 +42,19 @@ def templates(detector: Detector) -> Templates:
     """Templates of every nuclide of a detector with energy resolution."""
     names = detector.material_names
     walls = [names.index(name) for name in SHIELDS if name in names] or [0]
-    layers = [(wall, depth) for wall in walls for depth in DEPTHS]
-    layers += [(names.index(AIR), AIR_DEPTH)] if AIR in names else []
-    amounts = jnp.asarray(layers, jnp.float32)
+    layers = [(wall, depth, 0.0) for wall in walls for depth in DEPTHS]
+    if AIR in names:
+        layers += [(walls[0], 0.0, length) for length in AIR_M]
+        layers += [(wall, DEPTHS[-1], AIR_M[-1]) for wall in walls]
+    is_air = jnp.array([name == AIR for name in names])
 
     def of_nuclide(number: jax.Array) -> jax.Array:
-        bare = shielded(detector, number, jnp.zeros(len(names)))
+        def behind(layer: jax.Array) -> jax.Array:
+            wall = layer[0].astype(jnp.int32)
+            thickness = thickness_m(detector, number, wall, layer[1])
+            return shielded(detector, number, thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air)
 
-        def behind(amount: jax.Array) -> jax.Array:
-            wall = amount[0].astype(jnp.int32)
-            thickness = thickness_m(detector, number, wall, amount[1])
-            return shielded(detector, number, thickness * (jnp.arange(len(names)) == wall))
-
-        return jnp.concatenate([bare[None], jax.lax.map(behind, amounts)])
+        return jax.lax.map(behind, jnp.asarray([(walls[0], 0.0, 0.0), *layers], jnp.float32))
 
     slope = TILT * tilt(detector.energy_kev)
     background = detector.background_spectrum * jnp.stack([1.0 - slope, 1.0 + slope])
