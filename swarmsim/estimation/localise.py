@@ -24,6 +24,7 @@ from swarmsim.site.model import height_at
 
 LINES = 8  # of a nuclide, to which neighbours are put together
 WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
+BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known: half of it may be missing
 POINTS_MAX = 20_000  # of the grid of the first look
 ENOUGH_EFFECTIVE = 4.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
@@ -153,28 +154,21 @@ def presume(
     )
 
 
-BLIND_STD = 0.5
-"""Of a window's rate where walls are not known: two thirds of what a brick wall leaves of 662 keV."""
-
-
 def _known_site(site: Site, knowledge: Knowledge) -> Site:
     """The site without what is not known of it."""
     if knowledge.site in ("exact", "geometry"):
         return site
     boxes = site.obstacles
     nothing = replace(
-        boxes,
-        centre_m=np.asarray(boxes.centre_m)[:1],
-        half_extent_m=np.zeros((1, 3), np.float32),
-        axis=np.asarray(boxes.axis)[:1],
-        wall_m=np.zeros(1, np.float32),
-        material=np.asarray(boxes.material)[:1],
+        jax.tree.map(lambda x: on_host(np.asarray(x)[:1], np.asarray(x).dtype), boxes),
+        half_extent_m=on_host(np.zeros((1, 3))),
+        wall_m=on_host(np.zeros(1)),
     )
     site = replace(site, obstacles=nothing)
     if knowledge.site == "terrain":
         return site
     terrain = np.asarray(site.terrain_m)
-    return replace(site, terrain_m=np.full_like(terrain, terrain.mean()), above=None)
+    return replace(site, terrain_m=on_host(np.full_like(terrain, terrain.mean())), above=None)
 
 
 def _materials_of(site: Site) -> list[int]:

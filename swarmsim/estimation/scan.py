@@ -88,13 +88,14 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
 
     phi = _weights(points_m, m.position_m, m.valid)  # [J, C, n]
     nodes = len(NODES_M)
-    score = sum(phi[j] @ pushes[:, :, j] for j in range(nodes))
+    score = jnp.einsum("jcn,nkj->ck", phi, pushes)
     information = sum(
         (phi[i] * phi[j]) @ own[:, :, i, j] * (1.0 if i == j else 2.0) for i in range(nodes) for j in range(i, nodes)
     )
-    flat = crossings.reshape(*crossings.shape[:1], -1, nodes, k + d).transpose(2, 0, 1, 3)
-    cross = sum(phi[j] @ flat[j].reshape(flat.shape[1], -1) for j in range(nodes))
-    cross = cross.reshape(points_m.shape[0], allowed.shape[0], k + d)
+    flat = crossings.transpose(2, 0, 1, 3)  # [J, n, N, Q]
+    cross = jnp.einsum("jcn,jnq->cq", phi, flat.reshape(nodes, flat.shape[1], -1)).reshape(
+        points_m.shape[0], allowed.shape[0], k + d
+    )
     of_common = jnp.einsum("nrp,nrq->pq", common, across) + 1e-4 * jnp.eye(k + d)
     half = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(of_common), jnp.eye(k + d))
     information = information - jnp.einsum("ncp,pq,ncq->nc", cross, half, cross)

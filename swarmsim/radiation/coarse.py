@@ -4,6 +4,7 @@ An estimate asks for the rates of thousands of places, where the truth asks for 
 are attenuated alike and fall into the same region of interest, so that their yields can be added up.
 """
 
+import itertools
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -72,7 +73,7 @@ def _groups(energy: Floats, counts: Floats, most: int) -> Floats:
         return float(ca * cb / (ca + cb) * apart**2 / counts.sum())
 
     while len(groups) > 1:
-        costs = [cost(a, b) for a, b in zip(groups, groups[1:], strict=False)]
+        costs = [cost(a, b) for a, b in itertools.pairwise(groups)]
         k = int(np.argmin(costs))
         if len(groups) <= most and costs[k] > 0.02 * WIDTH**2:
             break

@@ -162,9 +162,9 @@ def _disagreement(aerial: Sequence[Estimate], final: Estimate) -> list[tuple[Sta
         distance = float(np.linalg.norm(apart))
         text = f"the {final.nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
         return [("inconsistent", text)]
-    shares = [e.activity_std_mbq / max(e.activity_mbq, 1e-9) for e in (before, final)]
+    shares = [float(e.activity_std_mbq) / max(e.activity_mbq, 1e-9) for e in (before, final)]
     ratio = np.log(max(final.activity_mbq, 1e-9) / max(before.activity_mbq, 1e-9))
-    if abs(ratio) > APART_SIGMA * np.hypot(np.hypot(*shares), MODEL_STD_LOG):
+    if abs(ratio) > APART_SIGMA * np.hypot(np.hypot(shares[0], shares[1]), MODEL_STD_LOG):
         text = f"the activity of the {final.nuclide} source by the survey and by all counts differs "
         return [("inconsistent", f"{text}{np.exp(abs(ratio)):.3g} times")]
     return []
