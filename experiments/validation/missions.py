@@ -68,7 +68,7 @@ def _detectable(simulation: Any, batch: Any) -> list[np.ndarray]:
     @jax.jit
     def of(windows: Any, key: jax.Array, plan: Any, place: Any, nuclide: Any, activity: Any) -> jax.Array:
         measurements, spans = gathered(world, plan, windows, key)
-        problem = problem_of(plan.presumed, measurements, spans, plan.localisation.rays)
+        problem = problem_of(plan.presumed, measurements, spans)
         state = no_sources(problem, place.shape[0], plan.presumed.nuclides.shape[0])
         sources = state.sources.__class__(
             place=place, nuclide=nuclide, activity_bq=activity, present=activity > 0.0,

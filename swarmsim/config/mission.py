@@ -140,20 +140,21 @@ class Localisation(Model):
 
     A source is one where twice the logarithm of the likelihood ratio exceeds the square of ``detection_sigma``. Sources
     are looked for at points ``grid_m`` apart, then among ``screened`` places around the best of them, then in
-    ``search_rounds`` rounds of half the reach each, the first of ``search_radius_m``. The posterior of each is that of
-    ``sample_rounds`` times ``samples`` places.
+    ``search_rounds`` rounds, the first within ``search_radius_m``, each within two fifths of the one before. The
+    posterior of each is that of ``sample_rounds`` times ``samples`` places. ``rays_per_window`` is for windows of
+    vehicles on the ground, which walls' shadows may cross.
     """
 
     presumed_height_m: float = Field(ge=-5, le=100)
     height_std_m: float = Field(ge=0, le=100)
     window_s: float = Field(ge=1e-3, le=3600)
-    rays_per_window: int = Field(default=1, ge=1, le=32)
+    rays_per_window: int = Field(default=3, ge=1, le=32)
     sources_max: int = Field(default=4, ge=1, le=8)
     detection_sigma: float = Field(default=5.5, ge=1, le=100)
     grid_m: float = Field(default=4.0, ge=0.1, le=1000)
     search_radius_m: float = Field(default=6.0, ge=0.01, le=1000)
     screened: int = Field(default=192, ge=16, le=10_000)
-    search_rounds: int = Field(default=4, ge=1, le=100)
+    search_rounds: int = Field(default=6, ge=1, le=100)
     sample_rounds: int = Field(default=6, ge=1, le=100)
     samples: int = Field(default=40, ge=16, le=10_000)
 
@@ -162,7 +163,7 @@ class Knowledge(Model):
     """What the mission knows of the world; the rest of the truth is drawn for each mission within these bounds.
 
     ``site``: ``exact``; ``geometry``, with walls up to ``thickness_share`` thinner or thicker than presumed, alike for
-    all of a material; ``terrain``, without anything that stands on it; ``none``, a plane. Measured places are off by
+    all of a material and standing within ``geometry_std_m`` of where they are presumed; ``terrain``, without anything that stands on it; ``none``, a plane. Measured places are off by
     ``pose_std_m`` for each vehicle (RTK), the sensitivity of a detector model by ``sensitivity_std``. ``nuclides`` are
     those in question. ``background_std`` is how much a background may differ from one window to the next, and
     ``model_std`` what is presumed of errors of the model of the rates, both as standard deviations of logarithms.
@@ -170,6 +171,7 @@ class Knowledge(Model):
 
     site: Literal["exact", "geometry", "terrain", "none"] = "geometry"
     thickness_share: float = Field(default=0.5, ge=0, le=0.9)
+    geometry_std_m: float = Field(default=0.05, ge=0, le=10)
     pose_std_m: float = Field(default=0.02, ge=0, le=10)
     sensitivity_std: float = Field(default=0.03, ge=0, le=0.5)
     background_std: float = Field(default=0.3, ge=0.01, le=1)

@@ -13,7 +13,7 @@ import numpy as np
 from swarmsim.config.mission import Knowledge, Localisation
 from swarmsim.estimation.likelihood import natural_background
 from swarmsim.estimation.measurements import Measurements, cleared
-from swarmsim.estimation.model import Problem, padded
+from swarmsim.estimation.model import Problem, Span, padded
 from swarmsim.estimation.posterior import posteriors
 from swarmsim.estimation.sources import SearchParams, State, find_sources, no_sources, ratios
 from swarmsim.pytree import on_host, pytree, static
@@ -40,6 +40,7 @@ class Presumed:
     background_std: jax.Array  # [] of a window's ln(background over the level)
     model_std: jax.Array  # [] of a window's ln(true over modelled rate)
     pose_std_m: jax.Array  # [] of measured places
+    place_std_m: jax.Array  # [] error of a source's place that all windows have in common: of poses and walls
     sensitivity_std: jax.Array  # [] of ln(true over presumed sensitivity) of a detector
     ground_share: jax.Array  # [] of the nominal background, which falls with height
     nuclides: jax.Array  # [N] bool, in question
@@ -55,7 +56,7 @@ class LocalisationParams:
     search: SearchParams
     sample_rounds: int = static()  # of the posterior's places
     samples: int = static()  # places in a round
-    rays: int = static()  # to a window, along its way
+    rays: int = static()  # to a window of a vehicle on the ground, along its way
 
 
 @pytree
@@ -120,7 +121,7 @@ def presume(
         ground_share: of the nominal background, which comes from the ground.
         corners_m: [V, 2] of the area in which sources are sought.
     """
-    known = _known_site(site, knowledge)
+    known, exact = _known_site(site, knowledge), knowledge.site == "exact"
     used = _materials_of(known)
     names = tuple(known.material_names[i] for i in used)
     new = np.zeros(len(known.material_names), np.int32)
@@ -145,6 +146,7 @@ def presume(
         background_std=on_host(knowledge.background_std),
         model_std=on_host(model),
         pose_std_m=on_host(knowledge.pose_std_m),
+        place_std_m=on_host(np.hypot(knowledge.pose_std_m, 0.0 if exact else knowledge.geometry_std_m)),
         sensitivity_std=on_host(knowledge.sensitivity_std),
         ground_share=on_host(ground_share),
         nuclides=on_host(chosen, bool),
@@ -187,9 +189,7 @@ def _grid(site: Site, corners_m: np.ndarray, step_m: float, height_m: float) -> 
     return np.column_stack([xy, height_at(site, xy) + height_m])
 
 
-def problem_of(
-    presumed: Presumed, measurements: Measurements, spans: tuple[tuple[int, int, int], ...], rays: int
-) -> Problem:
+def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span, ...]) -> Problem:
     """The data of an estimate; ``spans`` say which rows which detector model measured (`spans_of`)."""
     m = cleared(measurements)
     assert m.rois is not None
@@ -198,7 +198,7 @@ def problem_of(
     nominal = jnp.concatenate(
         [
             jnp.broadcast_to(padded(presumed.detectors[k].background_rois, regions), (last - first, regions))
-            for first, last, k in spans
+            for first, last, k, _ in spans
         ]
     )
     travel = jnp.sum(jnp.square(m.travel_m), axis=-1)
@@ -214,14 +214,13 @@ def problem_of(
         height_m=jnp.asarray(presumed.height_m),
         height_std_m=jnp.asarray(presumed.height_std_m),
         spans=spans,
-        rays=rays,
     )
 
 
 def localise(
     presumed: Presumed,
     measurements: Measurements,
-    spans: tuple[tuple[int, int, int], ...],
+    spans: tuple[Span, ...],
     params: LocalisationParams,
     known: State | None = None,
 ) -> Estimated:
@@ -234,7 +233,7 @@ def localise(
         params: settings.
         known: an earlier estimate's state, to go on from.
     """
-    problem = problem_of(presumed, measurements, spans, params.rays)
+    problem = problem_of(presumed, measurements, spans)
     points, nuclides = jnp.asarray(presumed.points_m), jnp.asarray(presumed.nuclides)
     state = no_sources(problem, params.search.sources_max, nuclides.shape[0])
     if known is not None:
@@ -266,7 +265,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
     fits = SourceFits(
         present=s.present,
         position_m=mean[:, :3].at[:, 2].add(height),
-        covariance_m2=jax.vmap(in_space)(mean, covariance),
+        covariance_m2=jax.vmap(in_space)(mean, covariance) + jnp.square(presumed.place_std_m) * jnp.eye(3),
         activity_bq=activity,
         activity_std_bq=activity * jnp.sqrt(log_variance),
         nuclide=s.nuclide,

@@ -30,7 +30,12 @@ from swarmsim.site.rays import Crossed, crossed_from
 MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count finite
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
+EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
 LOOSE = 1e-4  # precision of what has no prior
+
+
+Span = tuple[int, int, int, int]
+"""Rows from, to, their detector model, and the rays to each window along its way."""
 
 
 @pytree
@@ -47,8 +52,7 @@ class Problem:
     pose_std_m: jax.Array  # [n] of a window's place
     height_m: jax.Array  # [] prior of a source's height above ground
     height_std_m: jax.Array  # []
-    spans: tuple[tuple[int, int, int], ...] = static()  # rows from, to, and their detector
-    rays: int = static()  # to a window, along its way
+    spans: tuple[Span, ...] = static()
 
 
 @pytree
@@ -64,6 +68,15 @@ class Unknowns:
 
 
 @pytree
+class Rates:
+    """What a source of 1 Bq adds, before dead time."""
+
+    counts: jax.Array  # [n, R]
+    slopes: jax.Array  # [n, M, R] their derivatives by ln(length in each material)
+    edge: jax.Array  # [n] variance of their logarithm from shadows' edges that the window crosses
+
+
+@pytree
 class Settled:
     """The fit at one place."""
 
@@ -72,8 +85,7 @@ class Settled:
     unknowns: Unknowns
     covariance: jax.Array  # [P, P] of ln(activity), the others' factors, levels and lengths, the place held
     towards: jax.Array  # [3, 3] information about the place, the unknowns marginalised; as if nothing were in the way
-    net: jax.Array  # [n, R] counts per Bq before dead time, with the lengths of the fit
-    slopes: jax.Array  # [n, M, R] their derivatives by these
+    rates: Rates  # of the source, with the lengths of the fit
 
 
 @pytree
@@ -88,7 +100,7 @@ class Others:
 class Ways:
     """What lies between a place and the windows."""
 
-    crossed: Crossed  # [n rays, M]
+    crossed: tuple[Crossed, ...]  # for each span [rays m, M]
     position_m: jax.Array  # [3] of the place
 
 
@@ -97,60 +109,79 @@ def position_of(site: Site, place: jax.Array) -> jax.Array:
     return jnp.stack([place[0], place[1], sample(site.terrain_m, site, place[:2]) + place[2]])
 
 
-def crystals(problem: Problem) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Positions, axes and ways [n rays, 3] of the parts of the windows' ways."""
-    m, rays = problem.measurements, problem.rays
-    middle = (jnp.arange(rays) + 0.5) / rays - 0.5
-    position = (m.position_m[:, None] + middle[:, None] * m.travel_m[:, None]).reshape(-1, 3)
-    return position, jnp.repeat(m.axis, rays, axis=0), jnp.repeat(m.travel_m / rays, rays, axis=0)
+def crystals(problem: Problem, span: Span) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Places [rays m, 3] along the ways of a span's m windows, the crystal's axes there, and the shares of each [rays].
+
+    With one ray a window has its middle; with more the first and the last end of the way are among them, so that a
+    shadow's edge that a window crosses is seen in the spread between its rays.
+    """
+    first, last, _, rays = span
+    m = problem.measurements
+    position, travel, axis = (x[first:last] for x in (m.position_m, m.travel_m, m.axis))
+    if rays == 1:
+        return position, axis, jnp.ones(1)
+    node = jnp.linspace(-0.5, 0.5, rays)
+    share = jnp.ones(rays).at[jnp.array([0, rays - 1])].set(0.5) / (rays - 1)
+    along = position[:, None] + node[:, None] * travel[:, None]
+    return along.reshape(-1, 3), jnp.repeat(axis, rays, axis=0), share
 
 
 def ways_from(problem: Problem, place: jax.Array) -> Ways:
     """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
-    position, ends = position_of(problem.site, place), crystals(problem)[0]
+    position, materials = position_of(problem.site, place), len(problem.site.material_names)
     found = []
-    for first, last, _ in problem.spans:
-        part = ends[first * problem.rays : last * problem.rays]
-        none = Crossed(
-            length_m=jnp.zeros((part.shape[0], len(problem.site.material_names))),
-            place=jnp.zeros((part.shape[0], len(problem.site.material_names))),
-        )
-        used = jnp.any(problem.measurements.valid[first:last])
+    for span in problem.spans:
+        ends = crystals(problem, span)[0]
+        zero = jnp.zeros((ends.shape[0], materials))
+        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
         found.append(
-            jax.lax.cond(used, lambda part=part: crossed_from(problem.site, position, part), lambda none=none: none)
+            jax.lax.cond(
+                used,
+                lambda ends=ends: crossed_from(problem.site, position, ends),
+                lambda zero=zero: Crossed(length_m=zero, place=zero),
+            )
         )
-    return Ways(crossed=jax.tree.map(lambda *x: jnp.concatenate(x), *found), position_m=position)
+    return Ways(crossed=tuple(found), position_m=position)
 
 
-def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Counts [n, R] per Bq before dead time, and their derivatives [n, M, R] by ``lengths`` [M]."""
-    position, axis, travel = crystals(problem)
-    gain = travel_gain(position - ways.position_m, travel)
-    length = ways.crossed.length_m * jnp.exp(lengths)
+def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) -> Rates:
+    """Counts per Bq of a source of ``nuclide``; ``lengths`` [M] are logarithms of the factors of the path lengths."""
     source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
-    rays, regions = problem.rays, problem.background.shape[1]
     parts = []
-    for first, last, number in problem.spans:
-        span = slice(first * rays, last * rays)
-        part = Crossed(length_m=length[span], place=ways.crossed.place[span])
-        exposure = problem.measurements.exposure_s[first:last]
+    for span, crossed in zip(problem.spans, ways.crossed, strict=True):
+        way = Crossed(length_m=crossed.length_m * jnp.exp(lengths), place=crossed.place)
 
-        def over_windows(x: jax.Array, each: jax.Array = gain[span], exposure: jax.Array = exposure) -> jax.Array:
-            ones = [1] * (x.ndim - 1)
-            mean = jnp.mean((x * each.reshape(-1, *ones)).reshape(-1, rays, *x.shape[1:]), axis=1)
-            return padded(mean, regions) * exposure.reshape(-1, *ones)
-
-        def seen(part: Crossed = part, number: int = number, span: slice = span) -> tuple[jax.Array, jax.Array]:
-            detector = problem.detectors[number]
-            return roi_rates_and_slopes(detector, source, part, position[span], axis[span])
+        def seen(span: Span = span, way: Crossed = way) -> Rates:
+            return _rates_of_span(problem, span, source, way)
 
         def nothing(seen: Any = seen) -> Any:
             return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen))
 
-        used = jnp.any(problem.measurements.valid[first:last])
-        parts.append(tuple(map(over_windows, jax.lax.cond(used, seen, nothing))))
-    found, slopes = zip(*parts, strict=True)
-    return jnp.concatenate(found), jnp.concatenate(slopes)
+        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
+        parts.append(jax.lax.cond(used, seen, nothing))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+def _rates_of_span(problem: Problem, span: Span, source: Source, way: Crossed) -> Rates:
+    first, last, number, rays = span
+    position, axis, share = crystals(problem, span)
+    offset = position - source.position_m
+    rate, slope = roi_rates_and_slopes(problem.detectors[number], source, way, position, axis)
+    m = problem.measurements
+    gain = travel_gain(offset, m.travel_m[first:last]) if rays == 1 else jnp.ones(offset.shape[0])
+    exposure = m.exposure_s[first:last]
+
+    def over_windows(x: jax.Array) -> jax.Array:
+        ones = [1] * (x.ndim - 1)
+        each = (x * gain.reshape(-1, *ones)).reshape(-1, rays, *x.shape[1:])
+        mean = jnp.sum(each * share.reshape(-1, *ones), axis=1)
+        return padded(mean, problem.background.shape[1]) * exposure.reshape(-1, *ones)
+
+    strength = (jnp.sum(rate, axis=1) * jnp.sum(offset * offset, axis=1)).reshape(-1, rays)
+    mean = jnp.sum(share * strength, axis=1)
+    spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)
+    edge = EDGE_SHARE * jnp.where(mean > 0.0, spread, 0.0)
+    return Rates(counts=over_windows(rate), slopes=over_windows(slope), edge=edge)
 
 
 def padded(values: jax.Array, regions: int) -> jax.Array:
@@ -162,7 +193,7 @@ def dead_time(problem: Problem, counts: jax.Array) -> tuple[jax.Array, jax.Array
     """Share [n] of the true counts [n] of each window that is registered, and its derivative by them."""
     exposure = jnp.maximum(problem.measurements.exposure_s, 1e-9)
     shares, slopes = [], []
-    for first, last, number in problem.spans:
+    for first, last, number, _ in problem.spans:
         d, live = problem.detectors[number], exposure[first:last]
         rate = counts[first:last] / live
         share = jnp.exp(-rate * d.paralyzable_s) / (1.0 + rate * d.non_paralyzable_s)
@@ -198,16 +229,14 @@ class _Linear:
 
 def detector_of(problem: Problem) -> jax.Array:
     """One-hot [n, D]: the detector model of each row."""
-    rows = [jnp.full(last - first, number) for first, last, number in problem.spans]
+    rows = [jnp.full(last - first, number) for first, last, number, _ in problem.spans]
     return jax.nn.one_hot(jnp.concatenate(rows), len(problem.detectors))
 
 
-def _linear(
-    problem: Problem, net: jax.Array, slopes: jax.Array, others: Others, where: jax.Array, u: Unknowns
-) -> _Linear:
-    """The model at ``u``, with ``net`` [n, R] and ``slopes`` [n, M, R] per Bq of the source at ``where`` [3]."""
+def _linear(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> _Linear:
+    """The model at ``u``, with the rates of the source at ``where`` [3]."""
     gain = jnp.exp(u.gain)[:, None]
-    own = u.activity_bq * net * gain
+    own = u.activity_bq * source.counts * gain
     rest = others.counts * u.others[:, None, None] * gain  # [K, n, R]
     signal = own + jnp.sum(rest, axis=0)
     models = detector_of(problem)
@@ -221,7 +250,7 @@ def _linear(
         sums = jnp.sum(change, axis=1, keepdims=True)
         return share[:, None, None] * change + true[..., None] * (fall[:, None] * sums[:, 0])[:, None]
 
-    by_lengths = jnp.moveaxis(u.activity_bq * slopes, 1, 2) * gain[..., None]
+    by_lengths = jnp.moveaxis(u.activity_bq * source.slopes, 1, 2) * gain[..., None]
     by_level = background[..., None] * models[:, None]
     common = jnp.concatenate([own[..., None], jnp.moveaxis(rest, 0, 2), by_level, by_lengths], axis=-1)
     offset = where - problem.measurements.position_m
@@ -232,7 +261,7 @@ def _linear(
         common=seen(common),
         own=seen(jnp.stack([background, signal], axis=-1)),
         moved=seen(moved),
-        precision=_precision(problem, jnp.sum(own, axis=1), jnp.sum(rest, axis=2), others, where),
+        precision=_precision(problem, jnp.sum(own, axis=1), jnp.sum(rest, axis=2), others, where, source.edge),
     )
 
 
@@ -243,10 +272,12 @@ def variance_of(problem: Problem, where: jax.Array) -> jax.Array:
     return jnp.square(problem.model_std) + 4.0 * jnp.square(problem.pose_std_m) / squared
 
 
-def _precision(problem: Problem, own: jax.Array, rest: jax.Array, others: Others, where: jax.Array) -> jax.Array:
+def _precision(
+    problem: Problem, own: jax.Array, rest: jax.Array, others: Others, where: jax.Array, edge: jax.Array
+) -> jax.Array:
     """Precisions [n, 2] of a window's own unknowns; a gain stands for all sources, weighted with what they add."""
     total = own + jnp.sum(rest, axis=0)
-    varied = own * variance_of(problem, where) + jnp.sum(rest * others.variance, axis=0)
+    varied = own * (variance_of(problem, where) + edge) + jnp.sum(rest * others.variance, axis=0)
     model = jnp.square(problem.model_std)
     variance = jnp.where(total > 0.0, varied / jnp.maximum(total, 1e-20), model)
     background = jnp.broadcast_to(jnp.square(problem.background_std), variance.shape)
@@ -365,23 +396,23 @@ def settle(
     """
     m = problem.measurements
     assert m.rois is not None
-    net, slopes = rates(problem, ways, nuclide, start.lengths)
-    first = _first_activity(problem, net, others, start)
-    start = _with_activity(start, jnp.where(fresh, first, start.activity_bq))
+    source = rates(problem, ways, nuclide, start.lengths)
+    first = _first_activity(problem, source, others, start)
+    start = replace(start, activity_bq=jnp.where(fresh, first, start.activity_bq))
 
-    def linear(u: Unknowns, net: jax.Array, slopes: jax.Array) -> _Linear:
-        return _linear(problem, net, slopes, others, ways.position_m, u)
+    def linear(u: Unknowns, source: Rates) -> _Linear:
+        return _linear(problem, source, others, ways.position_m, u)
 
-    def step(carry: tuple[Unknowns, jax.Array, jax.Array], _: None) -> tuple[Any, None]:
-        u, net, slopes = carry
-        u = _moved(problem, u, _normal(problem, linear(u, net, slopes), u))
-        return (u, *rates(problem, ways, nuclide, u.lengths)), None
+    def step(carry: tuple[Unknowns, Rates], _: None) -> tuple[Any, None]:
+        u, source = carry
+        u = _moved(problem, u, _normal(problem, linear(u, source), u))
+        return (u, rates(problem, ways, nuclide, u.lengths)), None
 
-    (u, net, slopes), _ = jax.lax.scan(step, (start, net, slopes), None, length=steps)
-    return _settled(problem, linear(u, net, slopes), u, ways, net, slopes)
+    (u, source), _ = jax.lax.scan(step, (start, source), None, length=steps)
+    return _settled(problem, linear(u, source), u, ways, source)
 
 
-def _settled(problem: Problem, model: _Linear, u: Unknowns, ways: Ways, net: jax.Array, slopes: jax.Array) -> Settled:
+def _settled(problem: Problem, model: _Linear, u: Unknowns, ways: Ways, source: Rates) -> Settled:
     m = problem.measurements
     assert m.rois is not None
     at = _normal(problem, model, u)
@@ -403,23 +434,22 @@ def _settled(problem: Problem, model: _Linear, u: Unknowns, ways: Ways, net: jax
         unknowns=u,
         covariance=scaled_inverse(at.information),
         towards=at.towards,
-        net=net,
-        slopes=slopes,
+        rates=source,
     )
 
 
-def _with_activity(u: Unknowns, activity_bq: jax.Array) -> Unknowns:
-    return replace(u, activity_bq=activity_bq)
+def silent(problem: Problem) -> Rates:
+    """Rates of no source."""
+    n, regions = problem.background.shape
+    materials = problem.material_std.shape[0]
+    return Rates(counts=jnp.zeros((n, regions)), slopes=jnp.zeros((n, materials, regions)), edge=jnp.zeros(n))
 
 
-def _first_activity(problem: Problem, net: jax.Array, others: Others, u: Unknowns) -> jax.Array:
+def _first_activity(problem: Problem, source: Rates, others: Others, u: Unknowns) -> jax.Array:
     """Activity [] of least squares with everything else held, at least what gives ten counts in all."""
-    m = problem.measurements
+    m, net = problem.measurements, source.counts
     assert m.rois is not None
-    nothing = _with_activity(u, jnp.zeros(()))
-    model = _linear(
-        problem, net, jnp.zeros((net.shape[0], u.lengths.shape[0], net.shape[1])), others, jnp.zeros(3), nothing
-    )
+    model = _linear(problem, silent(problem), others, jnp.zeros(3), replace(u, activity_bq=jnp.zeros(())))
     # a background that varies is part of the variance, as if it did so in each region by itself
     variance = model.mean + jnp.square(problem.background_std * model.mean)
     weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(variance, MEAN_FLOOR), 0.0)
@@ -428,14 +458,14 @@ def _first_activity(problem: Problem, net: jax.Array, others: Others, u: Unknown
     return jnp.maximum(score / jnp.maximum(information, 1e-30), least)
 
 
-def spans_of(groups: Sequence[tuple[int, int]]) -> tuple[tuple[int, int, int], ...]:
-    """Spans from (rows, detector) of groups that follow one another; neighbours of one detector are one span."""
-    spans: list[tuple[int, int, int]] = []
+def spans_of(groups: Sequence[tuple[int, int, int]]) -> tuple[Span, ...]:
+    """Spans from (rows, detector, rays) of groups that follow one another; neighbours that are alike are one span."""
+    spans: list[Span] = []
     at = 0
-    for size, detector in groups:
-        if spans and spans[-1][2] == detector:
-            spans[-1] = (spans[-1][0], at + size, detector)
+    for size, detector, rays in groups:
+        if spans and spans[-1][2:] == (detector, rays):
+            spans[-1] = (spans[-1][0], at + size, detector, rays)
         elif size:
-            spans.append((at, at + size, detector))
+            spans.append((at, at + size, detector, rays))
         at += size
     return tuple(spans)

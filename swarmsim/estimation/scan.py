@@ -9,7 +9,7 @@ up to the direction to the crystal, so that both are matrix products: (points x 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.model import Others, Problem, Unknowns, _linear, _normal, detector_of, padded
+from swarmsim.estimation.model import Others, Problem, Unknowns, _linear, _normal, detector_of, padded, silent
 from swarmsim.pytree import pytree
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import roi_rates_and_slopes
@@ -54,8 +54,7 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     """
     m, regions = problem.measurements, problem.background.shape[1]
     assert m.rois is not None
-    nothing = jnp.zeros((m.counts.shape[0], u.lengths.shape[0], regions))
-    model = _linear(problem, jnp.zeros_like(m.rois), nothing, others, jnp.zeros(3), u)
+    model = _linear(problem, silent(problem), others, jnp.zeros(3), u)
     at = _normal(problem, model, u)
     weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, 1e-3), 0.0)
     names, models = problem.detectors[0].material_names, detector_of(problem)

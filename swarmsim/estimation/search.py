@@ -73,14 +73,14 @@ class Screen:
 def screen_of(problem: Problem, others: Others, at: Tried) -> Screen:
     """The screen from the fit ``at`` a place."""
     m, fit = problem.measurements, at.fit
-    u, net = fit.unknowns, fit.net
+    u, net = fit.unknowns, fit.rates.counts
     assert m.rois is not None
     where = position_of(problem.site, at.place)
-    model = _linear(problem, net, fit.slopes, others, where, u)
+    model = _linear(problem, fit.rates, others, where, u)
     linear = _normal(problem, model, u)
     zero = jnp.zeros_like(u.gain)
     bare = replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(()))
-    rest = _linear(problem, net, fit.slopes, others, where, bare)
+    rest = _linear(problem, fit.rates, others, where, bare)
     true = jnp.sum(u.activity_bq * net * jnp.exp(u.gain)[:, None], axis=1)
     added = jnp.sum(model.common[..., 0], axis=1)
     return Screen(
@@ -94,7 +94,7 @@ def screen_of(problem: Problem, others: Others, at: Tried) -> Screen:
 
 def screened(problem: Problem, screen: Screen, nuclide: jax.Array, lengths: jax.Array, place: jax.Array) -> jax.Array:
     """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted."""
-    net = rates(problem, ways_from(problem, place), nuclide, lengths)[0] * screen.share[:, None]
+    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts * screen.share[:, None]
     weighted = screen.weight * net
     inside = jnp.stack([jnp.sum(screen.own[..., k] * weighted, axis=1) for k in range(2)], axis=-1)
     of_left = jnp.stack([jnp.sum(screen.own[..., k] * screen.weight * screen.left, axis=1) for k in range(2)], axis=-1)

@@ -25,6 +25,7 @@ from swarmsim.estimation.model import (
     nothing_known,
     position_of,
     rates,
+    silent,
     variance_of,
     ways_from,
 )
@@ -34,11 +35,11 @@ from swarmsim.pytree import pytree, static
 
 ALONE_STEPS = 4  # Gauss-Newton steps without a further source
 SCREENED = 48  # places looked at in a later round of the search
-STARTS = 4  # grid points that are tried for a further source
+STARTS = 6  # grid points that are tried for a further source
 FAR = 1.5  # reach of the first round, in which the most are looked at
-CLOSING = 0.5  # reach of a round over that of the one before
+CLOSING = 0.4  # reach of a round over that of the one before
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
-APART_M = 8.0  # between starts
+APART_M = 12.0  # between starts
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 
@@ -105,8 +106,8 @@ def signals(problem: Problem, s: Sources, lengths: jax.Array) -> Others:
 
         def seen() -> Others:
             ways = ways_from(problem, place)
-            counts = activity * rates(problem, ways, nuclide, lengths)[0]
-            return Others(counts=counts, variance=variance_of(problem, ways.position_m))
+            found = rates(problem, ways, nuclide, lengths)
+            return Others(counts=activity * found.counts, variance=variance_of(problem, ways.position_m) + found.edge)
 
         return jax.lax.cond(there, seen, lambda: Others(counts=jnp.zeros((n, regions)), variance=jnp.zeros(n)))
 
@@ -117,10 +118,9 @@ def _alone(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[U
     """Best unknowns with the sources ``others`` alone, and the model there."""
     m = problem.measurements
     assert m.rois is not None
-    net, nothing = jnp.zeros_like(m.rois), jnp.zeros((m.counts.shape[0], u.lengths.shape[0], m.rois.shape[1]))
 
     def linear(u: Unknowns) -> Any:
-        return _linear(problem, net, nothing, others, jnp.zeros(3), u)
+        return _linear(problem, silent(problem), others, jnp.zeros(3), u)
 
     def step(u: Unknowns, _: None) -> tuple[Unknowns, None]:
         return _moved(problem, u, _normal(problem, linear(u), u)), None
@@ -321,9 +321,8 @@ def _best(
 
 def _nowhere(problem: Problem, u: Unknowns) -> Tried:
     """A place that is worse than any."""
-    n, regions = problem.background.shape
-    materials = u.lengths.shape[0]
-    unknown, shared = -jnp.asarray(jnp.inf), 1 + u.others.shape[0] + u.level.shape[0] + materials
+    unknown = -jnp.asarray(jnp.inf)
+    shared = 1 + u.others.shape[0] + u.level.shape[0] + u.lengths.shape[0]
     return Tried(
         place=jnp.zeros(3),
         fit=Settled(
@@ -332,8 +331,7 @@ def _nowhere(problem: Problem, u: Unknowns) -> Tried:
             unknowns=u,
             covariance=jnp.eye(shared),
             towards=jnp.eye(3),
-            net=jnp.zeros((n, regions)),
-            slopes=jnp.zeros((n, materials, regions)),
+            rates=silent(problem),
         ),
     )
 
@@ -351,8 +349,10 @@ def _with(problem: Problem, state: State, k: jax.Array, best: Tried, nuclide: ja
     )
     scaled = state.added.counts * u.others[:, None, None]
     added = Others(
-        counts=scaled.at[k].set(u.activity_bq * best.fit.net),
-        variance=state.added.variance.at[k].set(variance_of(problem, position_of(problem.site, best.place))),
+        counts=scaled.at[k].set(u.activity_bq * best.fit.rates.counts),
+        variance=state.added.variance.at[k].set(
+            variance_of(problem, position_of(problem.site, best.place)) + best.fit.rates.edge
+        ),
     )
     return State(sources=sources, added=added, unknowns=_shared(u), likelihood=best.fit.likelihood)
 

@@ -14,7 +14,7 @@ from swarmsim.estimation import (
     interpolate,
     localise,
 )
-from swarmsim.estimation.model import spans_of
+from swarmsim.estimation.model import Span, spans_of
 from swarmsim.estimation.windows import Windows, measured, merged
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey
@@ -26,6 +26,7 @@ from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
 from swarmsim.sensors.radiation import length_factors, sensitivity_factor
 from swarmsim.site import crossed
+from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import World
 
 
@@ -48,18 +49,16 @@ class Conclusion:
     estimated: Estimated  # from all counts
 
 
-Spans = tuple[tuple[int, int, int], ...]
-
-
 def gathered(
     world: World, plan: Plan, windows: tuple[Windows | None, ...], key: jax.Array
-) -> tuple[Measurements, Spans]:
+) -> tuple[Measurements, tuple[Span, ...]]:
     """Counts of all groups after one another, at the measured places, and which rows which detector model has.
 
     The places of each vehicle are off by the same error throughout, as those of a GNSS receiver with RTK are for
     minutes; ``key`` is the mission's.
     """
     assert plan.presumed is not None
+    assert plan.localisation is not None
     parts, groups = [], []
     for group, held, kept in zip(world.groups, windows, plan.kept, strict=True):
         if held is None or group.counter is None:
@@ -69,11 +68,13 @@ def gathered(
         off = plan.presumed.pose_std_m * jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
         few = replace(few, position_m=few.position_m + few.exposure_s[..., None] * off[:, None])
         parts.append(measured(few, group.counter.index))
-        groups.append((parts[-1].counts.shape[0], group.counter.index))
+        # what flies is far from what throws shadows
+        rays = 1 if KINDS[group.kind].FLIES else plan.localisation.rays
+        groups.append((parts[-1].counts.shape[0], group.counter.index, rays))
     return concatenate(*parts), spans_of(groups)
 
 
-def survey(plan: Plan, measurements: Measurements, spans: Spans) -> Survey:
+def survey(plan: Plan, measurements: Measurements, spans: tuple[Span, ...]) -> Survey:
     """Interpolate the map, find hotspots, and estimate the sources.
 
     The map joins detectors of several models by their nominal backgrounds: the exposure of each is multiplied by its
@@ -92,7 +93,7 @@ def survey(plan: Plan, measurements: Measurements, spans: Spans) -> Survey:
 
 
 def conclude(
-    key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements, spans: Spans
+    key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements, spans: tuple[Span, ...]
 ) -> Conclusion:
     """Identify the nuclide from the spectra near the first source, and estimate the sources from all counts.
 

@@ -121,8 +121,8 @@ def _doubts(
             f"the counts contradict the sources as modelled (chi-squared {fit.chi_squared:.2f} per degree of freedom, "
             f"{fit.misfit:.0f} standard deviations too large)",
         ))  # fmt: skip
-    for one in final:
-        found += _disagreement(aerial, one)
+    for one in aerial:
+        found += _disagreement(one, final)
     for one in final:
         if not one.converged:
             few = (
@@ -148,14 +148,14 @@ def _unexplained(chart: RadiationMap, final: Sequence[Estimate]) -> list[tuple[S
     return [("ambiguous", f"hotspots far from what was found suggest further sources, at {text} m")]
 
 
-def _disagreement(aerial: Sequence[Estimate], final: Estimate) -> list[tuple[Status, str]]:
-    """Between a source and the survey's nearest one of the same nuclide; one that the survey did not show has none."""
-    alike = [one for one in aerial if one.nuclide == final.nuclide]
+def _disagreement(before: Estimate, sources: Sequence[Estimate]) -> list[tuple[Status, str]]:
+    """Between a source of the survey and the nearest of the same nuclide by all counts."""
+    alike = [one for one in sources if one.nuclide == before.nuclide]
     if not alike:
         return []
-    place = np.asarray(final.position_m, float)[:2]
-    before = min(alike, key=lambda one: float(np.linalg.norm(np.asarray(one.position_m, float)[:2] - place)))
-    apart = place - np.asarray(before.position_m, float)[:2]
+    place = np.asarray(before.position_m, float)[:2]
+    final = min(alike, key=lambda one: float(np.linalg.norm(np.asarray(one.position_m, float)[:2] - place)))
+    apart = np.asarray(final.position_m, float)[:2] - place
     covariance = np.asarray(final.covariance_m2)[:2, :2] + np.asarray(before.covariance_m2)[:2, :2]
     covariance = covariance + MODEL_STD_M**2 * np.eye(2)
     if float(apart @ np.linalg.solve(covariance, apart)) > APART_SIGMA**2:

@@ -47,13 +47,11 @@ vehicles:
 wind: {speed_m_s: 2.0, from_deg: 240.0, gusts: true}
 mapping: {cell_m: 2.0, length_scale_m: 6.0, hotspots_max: 4, hotspot_separation_m: 15.0, significance_sigma: 5.0}
 localisation:
-  presumed_nuclide: Co-60
   presumed_height_m: 0.5
   height_std_m: 0.5
   window_s: 1.0
-  starts: 4
-  iterations: 200
-  learning_rate_m: 0.3
+  sources_max: 4
+knowledge: {nuclides: [Co-60]}
 identification: {spectrum_radius_m: 12.0, confidence_min: 0.9}
 phases:
   - name: survey

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from swarmsim.results.record import Estimate, RadiationMap, Samples
-from swarmsim.results.status import CERTAIN, Diagnostics, assess, coverage
+from swarmsim.results.status import CERTAIN, Fit, assess, coverage
 
-GOOD = Diagnostics(reduced_deviance=1.0, windows=400, effective_samples=80.0, converged=True, detection=900.0)
+GOOD = Fit(misfit=0.3, chi_squared=1.01)
 SIDE_M, HEIGHT_M = 60.0, 20.0
 
 
@@ -35,13 +35,13 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
     return Estimate(np.array([x, 0.0, 1.0]), covariance, activity, 0.05 * activity, 1.0, nuclide)
 
 
-def verdict(samples=None, hotspots=((0.0, 0.0),), found=True, diagnostics=GOOD, aerial=None, final=None, highest=184e3):
+def verdict(samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3):
     samples = survey() if samples is None else samples
     n = len(samples.counts)
     limits = (np.full(n, highest), np.full(n, 94.0))
     return assess(
-        samples, chart(hotspots), limits, np.zeros(n), found, diagnostics,
-        (aerial or estimate(1.0)) if found else None, (final or estimate()) if found else None,
+        samples, chart(hotspots), limits, np.zeros(n), fit,
+        (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (),
     )  # fmt: skip
 
 
@@ -58,11 +58,13 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"samples": survey(share=0.3), "found": False}, "incomplete_survey", r"only \d\d% of the survey area"),
         ({"samples": survey(rate=150e3)}, "saturated", "dead time"),
         ({"samples": survey(rate=2.0)}, "saturated", "dead time"),
-        ({"diagnostics": replace(GOOD, reduced_deviance=2.0)}, "inconsistent", "reduced deviance 2.0"),
-        ({"aerial": estimate(12.0, std=1.0)}, "inconsistent", "12 m apart"),
-        ({"final": estimate(activity=19e6)}, "inconsistent", "times"),
-        ({"diagnostics": replace(GOOD, converged=False, effective_samples=2.0)}, "detected", "did not settle"),
-        ({"final": estimate(std=14.0)}, "detected", "known to 14 m"),
+        ({"fit": Fit(misfit=20.0, chi_squared=1.6)}, "inconsistent", "chi-squared 1.60"),
+        ({"aerial": (estimate(12.0, std=1.0),)}, "inconsistent", "12 m apart"),
+        ({"final": (estimate(activity=19e6),)}, "inconsistent", "times"),
+        ({"final": (replace(estimate(), converged=False),)}, "ambiguous", "could not be searched"),
+        ({"final": (estimate(), replace(estimate(25.0), converged=False))}, "ambiguous", "could not be searched"),
+        ({"final": (estimate(std=14.0),)}, "detected", "known to 14 m"),
+        ({"final": (estimate(), estimate(20.0, std=14.0, nuclide="Cs-137"))}, "detected", "Cs-137 source is known to"),
         ({"hotspots": ((0.0, 0.0), (-28.0, 0.0))}, "ambiguous", "further sources"),
     ],
 )
@@ -73,8 +75,17 @@ def test_each_doubt_has_its_status_and_sentence(given, status: str, said: str) -
     assert any(re.search(said, reason) for reason in found.reasons)
 
 
+def test_a_source_that_the_survey_did_not_show_is_compared_with_none() -> None:
+    assert verdict(aerial=(estimate(30.0, std=0.5, nuclide="Cs-137"),)).status == "located"
+
+
+def test_a_hotspot_that_a_further_source_explains_is_no_doubt() -> None:
+    two = (estimate(), estimate(-27.0, nuclide="Cs-137"))
+    assert verdict(final=two, hotspots=((0.0, 0.0), (-28.0, 0.0))).status == "located"
+
+
 def test_the_gravest_doubt_decides_and_all_are_told() -> None:
-    both = verdict(diagnostics=replace(GOOD, reduced_deviance=9.0), hotspots=((0.0, 0.0), (-28.0, 0.0)))
+    both = verdict(fit=Fit(misfit=90.0, chi_squared=9.0), hotspots=((0.0, 0.0), (-28.0, 0.0)))
     assert both.status == "inconsistent"
     assert len(both.reasons) == 2
 
