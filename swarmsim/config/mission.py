@@ -163,10 +163,11 @@ class Knowledge(Model):
     """What the mission knows of the world; the rest of the truth is drawn for each mission within these bounds.
 
     ``site``: ``exact``; ``geometry``, with walls up to ``thickness_share`` thinner or thicker than presumed, alike for
-    all of a material and standing within ``geometry_std_m`` of where they are presumed; ``terrain``, without anything that stands on it; ``none``, a plane. Measured places are off by
-    ``pose_std_m`` for each vehicle (RTK), the sensitivity of a detector model by ``sensitivity_std``. ``nuclides`` are
-    those in question. ``background_std`` is how much a background may differ from one window to the next, and
-    ``model_std`` what is presumed of errors of the model of the rates, both as standard deviations of logarithms.
+    all of a material, and standing within ``geometry_std_m`` of where they are presumed; ``terrain``, without anything
+    that stands on it; ``none``, a plane. Measured places are off by ``pose_std_m`` for each vehicle (RTK), the
+    sensitivity of a detector model by ``sensitivity_std``. ``nuclides`` are those in question. ``background_std`` is
+    how much a background may differ from one window to the next, and ``model_std`` what is presumed of errors of the
+    model of the rates, both as standard deviations of logarithms.
     """
 
     site: Literal["exact", "geometry", "terrain", "none"] = "geometry"

@@ -51,11 +51,14 @@ def test_a_shipped_mission_resolves_fits_its_site_and_is_read_back(name: str, tm
     assert again.to_yaml() == scenario.to_yaml()
 
 
-def test_the_paper_mission_differs_in_the_detector_and_its_flat_background_only() -> None:
+def test_the_paper_mission_differs_in_detector_background_and_knowledge_only() -> None:
     physical, paper = load_scenario("recon").mission, load_scenario("recon_paper").mission
     assert paper.detection == "paper_ideal"
     assert paper.background == physical.background.model_copy(update={"ground_share": 0.0})
+    assert paper.knowledge.site == "exact"
+    assert paper.knowledge.pose_std_m == paper.knowledge.sensitivity_std == 0.0
     changes = {"name": "recon_paper", "detection": "paper_ideal", "background": paper.background}
+    changes["knowledge"] = paper.knowledge
     assert paper == physical.model_copy(update=changes)
 
 

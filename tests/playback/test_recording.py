@@ -211,7 +211,7 @@ def test_truth_is_static_and_estimates_come_when_they_are_made(recording: Record
     assert found.survey_estimate is not None
     assert found.estimate is not None
     for name, estimate, phase in (("survey", found.survey_estimate, 0), ("final", found.estimate, 1)):
-        entity = f"/world/estimate/{name}/ellipsoid"
+        entity = f"/world/estimate/{name}/0/ellipsoid"
         when, (half_sizes,) = recording.rows(entity, "Ellipsoids3D:half_sizes")
         assert when == pytest.approx([found.phases[phase].end_s])
         expected = np.sqrt(7.815 * np.linalg.eigvalsh(estimate.covariance_m2))

@@ -32,7 +32,8 @@ def field():
     counter = replace(group.counter, mount_position_m=MOUNTS, mount_axis=AXES)
     assert (counter.ticks, counter.evaluations) == (EVERY, EXPOSURE // EVERY)
     even = replace(made.background, ground_share=jnp.float32(0.0))
-    return replace(made, background=even, groups=(replace(group, counter=counter),))
+    departures = replace(made.departures, sensitivity_std=jnp.float32(0.0))
+    return replace(made, background=even, departures=departures, groups=(replace(group, counter=counter),))
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def sampled(field, way, active, key):
         number, body, active = x
         state = count(
             group.counter, unread(state), body, active, member, field.site, field.sources, field.background,
-            key, number, jnp.float32(TICK_S), number % EVERY == 0,
+            field.departures, key, number, jnp.float32(TICK_S), number % EVERY == 0,
         )  # fmt: skip
         return state, (state.reading, state.expected_counts)
 
@@ -153,7 +154,7 @@ def test_the_draw_depends_on_the_vehicles_number_and_not_on_its_company(field, w
         def tick(state, x):
             state = count(
                 counter, unread(state), x[1], jnp.ones(1, bool), jnp.array([7]), field.site, field.sources,
-                field.background, jax.random.key(0), x[0], jnp.float32(TICK_S), x[0] % EVERY == 0,
+                field.background, field.departures, jax.random.key(0), x[0], jnp.float32(TICK_S), x[0] % EVERY == 0,
             )  # fmt: skip
             return state, state.reading
 
