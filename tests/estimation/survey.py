@@ -163,6 +163,13 @@ def drawn(m, mean, seed):
     return counted(m, np.random.default_rng(seed).poisson(np.asarray(mean)))
 
 
+def drawn_of_one(site, detector, m, position, activity, seed):
+    """Counts by region drawn for one source of the first nuclide that ``detector`` knows."""
+    source = Source(position_m=jnp.asarray(position), activity_bq=jnp.float32(activity), nuclide=NUCLIDE)
+    net = _source_rois(site, detector, source, m.position_m, m.axis)
+    return drawn(m, observed_rois(detector, net, jnp.ones(len(net))) * m.exposure_s[:, None], seed)
+
+
 def spec(**changes):
     """Few places are tried: enough in the open, and fast."""
     few = {"screened": 48, "search_rounds": 3, "sample_rounds": 4, "samples": 32, "sources_max": 2}

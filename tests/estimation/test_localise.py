@@ -7,12 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmsim.config.mission import Knowledge
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
 pytestmark = pytest.mark.optimised
 
 SITE = place(NOWHERE)
+CERTAIN = Knowledge(site="exact", background_std=0.01, model_std=0.001)
 CO_60 = [(SOURCE, ACTIVITY, "Co-60")]
 
 
@@ -55,7 +57,8 @@ def test_expected_counts_give_the_truth_back(localiser):
     )
     truth = jnp.array([12.0, 4.0, 12.0 * 0.05 - 4.0 * 0.1 + 1.0])
     m = counted(flight, mean_rois(site, DETECTORS, flight, [(truth, ACTIVITY, "Co-60")]))
-    estimated = localiser(m, presumed(site, DETECTORS))
+    # counts without any deviation in them would make those that are presumed look as if they were less elsewhere
+    estimated = localiser(m, presumed(site, DETECTORS, knowledge=CERTAIN))
     fits = estimated.fits
     assert np.all(np.abs(np.asarray(fits.position_m[0] - truth)) < 0.25 * sigma(fits))
     np.testing.assert_allclose(fits.activity_bq[0], ACTIVITY, rtol=0.01)
