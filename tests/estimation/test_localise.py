@@ -104,7 +104,11 @@ def test_two_sources_of_different_nuclides_are_both_found(localiser, seed):
 
 
 def test_no_more_sources_are_found_than_there_is_room_for(localiser):
-    truth = [((-35.0, -30.0, 1.0), 300e6, "Co-60"), ((35.0, 0.0, 1.0), 700e6, "Cs-137"), ((-30.0, 40.0, 1.0), 700e6, "I-131")]
+    truth = [
+        ((-35.0, -30.0, 1.0), 300e6, "Co-60"),
+        ((35.0, 0.0, 1.0), 700e6, "Cs-137"),
+        ((-30.0, 40.0, 1.0), 700e6, "I-131"),
+    ]
     estimated = localiser(drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, truth), 1))
     assert estimated.fits.present.tolist() == [True, True]
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(estimated.fits))

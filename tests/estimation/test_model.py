@@ -113,13 +113,9 @@ def test_without_a_source_the_score_is_nothing_anywhere():
         assert abs(float(found.statistic[0])) < 0.01
 
 
-@given(
-    st.lists(st.floats(0.0, 3e5), min_size=4, max_size=4), st.floats(0.0, 1e-5), st.floats(0.0, 1e-5)
-)
+@given(st.lists(st.floats(0.0, 3e5), min_size=4, max_size=4), st.floats(0.0, 1e-5), st.floats(0.0, 1e-5))
 def test_dead_time_is_that_of_the_detector(rates, paralyzable, non_paralyzable):
-    d = replace(
-        DETECTORS[0], paralyzable_s=jnp.float32(paralyzable), non_paralyzable_s=jnp.float32(non_paralyzable)
-    )
+    d = replace(DETECTORS[0], paralyzable_s=jnp.float32(paralyzable), non_paralyzable_s=jnp.float32(non_paralyzable))
     known, m = told(place(half=40.0), [])
     exposure = jnp.where(jnp.arange(120) % 2 == 0, 0.5, 3.0)
     problem = problem_of(known, replace(m, exposure_s=exposure), SPANS, 1)
