@@ -76,7 +76,9 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
             "nra,na...->nr...", model.own, inside
         )
 
-    left = eliminated(m.rois - model.mean)  # [n, R]
+    # the fit's own deviations have taken up their part already: only what still pushes them is eliminated
+    still = jnp.einsum("nab,nb->na", at.own, at.own_push)
+    left = weight * (m.rois - model.mean - jnp.einsum("nra,na->nr", model.own, still))  # [n, R]
     across = eliminated(common)  # [n, R, Q]
     shape = scale[:, None, None, None] * jnp.einsum("nd,dcjr->ncjr", models, kernel)  # [n, N, J, R]
     pushes = jnp.einsum("ncjr,nr->ncj", shape, left)

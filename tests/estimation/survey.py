@@ -8,14 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.load import load_named
-from swarmsim.config.mission import Localisation, Mapping
+from swarmsim.config.mission import Knowledge, Localisation, Mapping
 from swarmsim.config.radiation import DetectorMount
-from swarmsim.estimation import Measurements, localisation_params, mapping_params, net_rates
-from swarmsim.radiation import build_detector, load_library, observed_rate, restrict
-from swarmsim.site import Obstacles, Site
+from swarmsim.estimation import Measurements, mapping_params, net_rates, presume
+from swarmsim.radiation import Source, build_detector, load_library, observed_rate, restrict
+from swarmsim.radiation.rate import observed_rois, roi_rates
+from swarmsim.site import Obstacles, Site, crossed
 
 _net_rates = jax.jit(net_rates)
 NUCLIDE = jnp.int32(0)  # the only one that the restricted detectors know: Co-60
+NUCLIDES = ("Co-60", "Cs-137", "I-131", "Ir-192", "Ba-133", "Se-75")  # of `spectrometer`
 HALF = 70.0  # m, half the side of the surveyed square
 
 
@@ -114,18 +116,71 @@ def mapping(half=HALF, variance_kept=0.95, **changes):
     return mapping_params(Mapping(**(spec | changes)), area, variance_kept)
 
 
-def settings(height=1.0, height_std=0.5, **changes):
-    spec = {
-        "presumed_nuclide": "Co-60",
-        "presumed_height_m": height,
-        "height_std_m": height_std,
-        "window_s": 1.0,
-        "starts": 4,
-        "iterations": 200,
-        "learning_rate_m": 0.3,
-    }
-    return localisation_params(Localisation(**(spec | changes)))
+@cache
+def spectrometer(model="nai_1p5x1p5"):
+    """A detector that knows `NUCLIDES`, with its regions of interest."""
+    mount = DetectorMount(model=model, position_m=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    return restrict(build_detector(load_named("detectors", model), mount, library(), "physical"), NUCLIDES)
+
+
+def mean_rois(site, detectors, m, sources=(), background=1.0):
+    """Expected counts [n, R] by region of interest of (position, activity, nuclide's name), as a counter has them.
+
+    ``background`` [] or [n] is that over the nominal one.
+    """
+    background = jnp.broadcast_to(jnp.asarray(background, jnp.float32), m.counts.shape)
+    net = [jnp.zeros((m.counts.shape[0], d.background_rois.shape[0])) for d in detectors]
+    for position, activity, name in sources:
+        source = Source(
+            position_m=jnp.asarray(position, jnp.float32),
+            activity_bq=jnp.float32(activity),
+            nuclide=jnp.int32(NUCLIDES.index(name)),
+        )
+        net = [
+            before + _source_rois(site, d, source, m.position_m, m.axis)
+            for before, d in zip(net, detectors, strict=True)
+        ]
+    rates = jnp.stack([observed_rois(d, x, background) for d, x in zip(detectors, net, strict=True)])
+    which = jnp.arange(m.counts.shape[0])
+    return rates[m.detector, which] * m.exposure_s[:, None]
+
+
+@jax.jit
+def _source_rois(site, detector, source, position, axis):
+    def one(place, along):
+        return roi_rates(detector, source, crossed(site, source.position_m, place), place, along)
+
+    return jax.vmap(one)(position, axis)
+
+
+def counted(m, rois):
+    """The same measurements with these counts [n, R]."""
+    return replace(m, rois=jnp.asarray(rois, jnp.float32), counts=jnp.sum(jnp.asarray(rois, jnp.float32), axis=1))
+
+
+def drawn(m, mean, seed):
+    """The same measurements with counts by region drawn about their means [n, R]."""
+    return counted(m, np.random.default_rng(seed).poisson(np.asarray(mean)))
+
+
+def drawn_of_one(site, detector, m, position, activity, seed):
+    """Counts by region drawn for one source of the first nuclide that ``detector`` knows."""
+    source = Source(position_m=jnp.asarray(position), activity_bq=jnp.float32(activity), nuclide=NUCLIDE)
+    net = _source_rois(site, detector, source, m.position_m, m.axis)
+    return drawn(m, observed_rois(detector, net, jnp.ones(len(net))) * m.exposure_s[:, None], seed)
+
+
+def spec(**changes):
+    """Few places are tried: enough in the open, and fast."""
+    few = {"screened": 48, "search_rounds": 3, "sample_rounds": 4, "samples": 32, "sources_max": 2}
+    given = {"presumed_height_m": 1.0, "height_std_m": 0.5, "window_s": 1.0}
+    return Localisation(**(given | few | changes))
+
+
+def presumed(site, detectors, half=HALF, knowledge=None, **changes):
+    """What a mission presumes that knows the site and may meet a background that varies."""
+    corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return presume(site, detectors, spec(**changes), knowledge or Knowledge(site="exact"), 0.0, corners)
 
 
 SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
-QUICK = settings(iterations=120, search_rounds=2, fisher_steps=4, rays_per_window=1, sample_rounds=4, samples=32)

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmsim.estimation import RadiationMap, extract_hotspots, initial_points, interpolate
+from swarmsim.estimation import RadiationMap, extract_hotspots, interpolate
 from tests.estimation.survey import detector, draw, mapping, mean_rates, place, survey
 
 pytestmark = pytest.mark.optimised
@@ -84,13 +84,3 @@ def test_a_flat_map_above_the_threshold_still_has_a_fixed_size():
     found = extract_hotspots(PARAMS, synthetic_map(jnp.full((28, 28), 6.0)))
     assert found.position_m.shape == (4, 2)
     assert len({tuple(p) for p in found.position_m.tolist()}) == 4
-
-
-def test_search_starts_at_the_hotspots_and_then_around_the_strongest():
-    found = extract_hotspots(PARAMS, synthetic_map(bumps((0.0, 0.0, 20.0), (-25.0, 25.0, 12.0))))
-    points = initial_points(PARAMS, found, 6)
-    np.testing.assert_array_equal(points[:2], found.position_m[:2])
-    distance = np.linalg.norm(np.asarray(points[2:] - found.position_m[0]), axis=1)
-    assert np.all((distance > 3.0) & (distance < 12.0))
-    assert len({tuple(p) for p in np.round(np.asarray(points), 2).tolist()}) == 6
-    np.testing.assert_array_equal(initial_points(PARAMS, found, 1), found.position_m[:1])

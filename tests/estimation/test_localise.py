@@ -1,150 +1,185 @@
+"""Sources found in the counts by region of interest of a survey of open ground, and behind walls."""
+
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmsim.estimation import (
-    concatenate,
-    detected,
-    localise,
-    net_rates,
-)
-from tests.estimation.survey import (
-    ACTIVITY,
-    NUCLIDE,
-    QUICK,
-    SOURCE,
-    detector,
-    draw,
-    mean_rates,
-    orbit,
-    place,
-    survey,
-)
+from swarmsim.config.mission import Knowledge
+from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
+from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
-STARTS = jnp.array([[5.0, 8.0], [20.0, -2.0]])
-_compiled = jax.jit(localise)
+pytestmark = pytest.mark.optimised
+
+SITE = place(NOWHERE)
+CERTAIN = Knowledge(site="exact", background_std=0.01, model_std=0.001)
+CO_60 = [(SOURCE, ACTIVITY, "Co-60")]
 
 
-def _localise(site, detectors, m, starts, nuclide, params, extra=None):
-    """`localise`, always with an extra rate, so that tests share compiled programs."""
-    return _compiled(site, detectors, m, starts, nuclide, params, jnp.zeros_like(m.counts) if extra is None else extra)
+def names(estimated):
+    return [NUCLIDES[int(k)] for k in estimated.fits.nuclide]
 
 
-def noiseless(site, detectors, measurements, sources):
-    return replace(measurements, counts=mean_rates(site, detectors, measurements, sources) * measurements.exposure_s)
+def sigma(fits, k=0):
+    return np.sqrt(np.diag(fits.covariance_m2[k]))
 
 
-def test_expected_counts_give_the_truth_back():
-    site, d = place(slope=(0.05, -0.1)), (detector(),)
+def deviations(fits, position, activity, k=0):
+    """Errors of x, y and the activity over the stated standard deviations."""
+    place_error = np.asarray(fits.position_m[k] - jnp.asarray(position))[:2] / sigma(fits, k)[:2]
+    return np.append(place_error, float(fits.activity_bq[k] - activity) / float(fits.activity_std_bq[k]))
+
+
+def test_one_source_in_the_open_is_found_and_its_errors_are_as_stated(localiser):
+    rng = np.random.default_rng(4)
+    found = []
+    for seed in range(8):
+        name = NUCLIDES[seed % 3]
+        activity = {"Co-60": 170e6, "Cs-137": 400e6, "I-131": 450e6}[name] * rng.uniform(0.8, 1.5)
+        position = np.append(rng.uniform(-50.0, 50.0, 2), rng.uniform(0.6, 1.4))
+        estimated = localiser(drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, [(position, activity, name)]), seed))
+        assert estimated.fits.present.tolist() == [True, False]
+        assert names(estimated)[0] == name
+        assert float(estimated.fits.nuclide_confidence[0]) > 0.9
+        assert np.all(sigma(estimated.fits)[:2] < 5.0)
+        found.append(deviations(estimated.fits, position, activity))
+        assert np.all(np.abs(found[-1]) < 3.0)
+        assert abs(float(estimated.misfit)) < 4.0
+    assert 0.4 < np.sqrt(np.mean(np.square(found))) < 1.6
+
+
+def test_expected_counts_give_the_truth_back(localiser):
+    site = place(NOWHERE, slope=(0.05, -0.1))
+    flight = replace(
+        AERIAL, position_m=AERIAL.position_m.at[:, 2].add(AERIAL.position_m[:, :2] @ jnp.array([0.05, -0.1]))
+    )
     truth = jnp.array([12.0, 4.0, 12.0 * 0.05 - 4.0 * 0.1 + 1.0])
-    m = noiseless(site, d, survey(count=300, slope=(0.05, -0.1)), [(truth, ACTIVITY)])
-    fit = _localise(site, d, m, STARTS, NUCLIDE, QUICK)
-    sigma = np.sqrt(np.diag(fit.covariance_m2))
-    assert np.all(np.abs(np.asarray(fit.position_m - truth)) < 0.25 * sigma)  # sampling, and the skew of the posterior
-    assert np.all(sigma < [2.5, 2.5, 0.6])
-    np.testing.assert_allclose(fit.activity_bq, ACTIVITY, rtol=0.01)
-    np.testing.assert_allclose(fit.background_scale, 1.0, rtol=0.003)
-    assert bool(fit.converged)
-    assert abs(float(fit.log_likelihood)) < 0.05
+    m = counted(flight, mean_rois(site, DETECTORS, flight, [(truth, ACTIVITY, "Co-60")]))
+    # counts without any deviation in them would make those that are presumed look as if they were less elsewhere
+    estimated = localiser(m, presumed(site, DETECTORS, knowledge=CERTAIN))
+    fits = estimated.fits
+    assert np.all(np.abs(np.asarray(fits.position_m[0] - truth)) < 0.25 * sigma(fits))
+    np.testing.assert_allclose(fits.activity_bq[0], ACTIVITY, rtol=0.01)
+    np.testing.assert_allclose(estimated.background_scale, 1.0, rtol=0.003)
+    assert bool(fits.converged[0])
+    # expected counts lie closer to the model than drawn ones ever do
+    assert float(estimated.misfit) < -10.0
+    assert int(estimated.windows) == 300
 
 
-def test_a_known_height_stays_fixed():
-    fixed = replace(QUICK, presumed_height_m=jnp.float32(0.5), height_std_m=jnp.float32(0.0))
-    m = noiseless(place(), (detector(),), survey(count=300), [(SOURCE, ACTIVITY)])
-    fit = _localise(place(), (detector(),), m, STARTS, NUCLIDE, fixed)
-    np.testing.assert_allclose(fit.position_m[2], 0.5, atol=0.01)
-    assert float(fit.covariance_m2[2, 2]) < 1e-5
+def test_a_known_height_stays_fixed(localiser):
+    fixed = replace(localiser.presumed, height_m=jnp.float32(0.5), height_std_m=jnp.float32(0.0))
+    fits = localiser(counted(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, CO_60)), fixed).fits
+    np.testing.assert_allclose(fits.position_m[0, 2], 0.5, atol=0.01)
+    assert float(fits.covariance_m2[0, 2, 2]) < 1e-5
 
 
-def test_a_source_behind_a_wall_is_found_where_it_is():
+@pytest.mark.parametrize("seed", range(8))
+def test_no_source_is_found_in_a_background_with_a_step(localiser, seed):
+    turn = 2.0 * np.pi * seed / 8.0
+    across = AERIAL.position_m[:, :2] @ jnp.array([np.cos(turn), np.sin(turn)])
+    background = jnp.where(across > 0.0, 1.2, 1.0)
+    estimated = localiser(drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, background=background), seed))
+    assert not np.any(estimated.fits.present)
+    assert np.all(np.asarray(estimated.fits.detection) == 0.0)
+    assert 0.95 < float(estimated.background_scale) < 1.25
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_sources_of_different_nuclides_are_both_found(localiser, seed):
+    turn = 1.0 + 2.0 * seed
+    along = 20.0 * np.array([np.cos(turn), np.sin(turn), 0.0])
+    middle = np.array([5.0, -8.0, 1.0])
+    truth = {"Co-60": (middle + along, 200e6), "Cs-137": (middle - along, 450e6)}
+    mean = mean_rois(SITE, DETECTORS, AERIAL, [(p, a, name) for name, (p, a) in truth.items()])
+    estimated = localiser(drawn(AERIAL, mean, seed))
+    assert estimated.fits.present.tolist() == [True, True]
+    assert sorted(names(estimated)) == sorted(truth)
+    for k, name in enumerate(names(estimated)):
+        assert np.all(np.abs(deviations(estimated.fits, *truth[name], k)) < 4.0)
+        assert float(estimated.fits.detection[k]) > float(localiser.params.search.threshold)
+    assert float(estimated.fits.detection[0]) >= float(estimated.fits.detection[1])
+
+
+def test_no_more_sources_are_found_than_there_is_room_for(localiser):
+    truth = [
+        ((-35.0, -30.0, 1.0), 300e6, "Co-60"),
+        ((35.0, 0.0, 1.0), 700e6, "Cs-137"),
+        ((-30.0, 40.0, 1.0), 700e6, "I-131"),
+    ]
+    estimated = localiser(drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, truth), 1))
+    assert estimated.fits.present.tolist() == [True, True]
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(estimated.fits))
+    # one cannot be told: the misfit says that something is missing
+    assert float(estimated.misfit) > 5.0
+
+
+def test_an_earlier_state_leads_to_the_same_source_when_there_are_more_windows(localiser):
+    m = drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, CO_60), 2)
+    earlier = localiser(replace(m, valid=m.valid & (jnp.arange(360) < 220)))
+    assert earlier.fits.present.tolist() == [True, False]
+    on, anew = localiser(m, known=earlier.state), localiser(m)
+    assert on.fits.present.tolist() == [True, False]
+    assert names(on)[0] == "Co-60"
+    assert np.all(np.abs(deviations(on.fits, SOURCE, ACTIVITY)) < 3.0)
+    apart = np.asarray(on.fits.position_m[0] - anew.fits.position_m[0])
+    assert np.all(np.abs(apart) < 0.5 * sigma(anew.fits))
+    np.testing.assert_allclose(on.fits.activity_bq[0], anew.fits.activity_bq[0], rtol=0.05)
+    assert float(on.fits.detection[0]) > float(earlier.fits.detection[0])
+
+
+def test_a_source_behind_a_wall_is_found_where_it_is(localiser):
     wall = [((9.0, 4.0, 2.0), (0.3, 6.0, 2.0), "concrete"), ((12.0, 8.5, 1.5), (3.0, 0.3, 1.5), "concrete")]
-    site, d = place(wall), (detector(), detector(model="nai_2x2"))
-    drive = orbit((12.0, 4.0), 7.0, 60)
-    m = concatenate(survey(count=300), drive)
-    rates = mean_rates(site, d, m, [(SOURCE, ACTIVITY)])
-    fits = [_localise(site, d, draw(m, rates, seed), STARTS, NUCLIDE, QUICK) for seed in range(4)]
-    for fit in fits:
-        assert np.linalg.norm((fit.position_m - SOURCE)[:2]) < 0.5
-        assert 0.7 < float(fit.reduced_deviance) < 1.3
-    # A model blind to the walls puts it elsewhere: the walls are what is tested.
-    blind = _localise(place(), d, draw(m, rates, 3), STARTS, NUCLIDE, QUICK)
-    assert float(blind.reduced_deviance) > 3.0
+    site = place(wall)
+    mean = mean_rois(site, DETECTORS, BOTH, CO_60)
+    draws = [drawn(BOTH, mean, seed) for seed in range(4)]
+    for m in draws:
+        estimated = localiser(m, presumed(site, DETECTORS))
+        assert estimated.fits.present.tolist() == [True, False]
+        assert np.linalg.norm((estimated.fits.position_m[0] - SOURCE)[:2]) < 0.5
+        assert 0.7 < float(estimated.chi_squared) < 1.3
+    # a model blind to the walls does not describe the counts: the walls are what is tested
+    assert float(localiser(draws[3]).misfit) > 5.0
 
 
-def test_ground_data_sharpen_the_aerial_estimate():
-    site, d = place(), (detector(), detector(model="nai_2x2"))
-    m = concatenate(survey(count=300), orbit((12.0, 4.0), 5.0, 60))
-    m = noiseless(site, d, m, [(SOURCE, ACTIVITY)])
-    both = _localise(site, d, m, STARTS, NUCLIDE, QUICK)
-    aerial = _localise(site, d, replace(m, valid=m.detector == 0), STARTS, NUCLIDE, QUICK)
-    assert float(both.covariance_m2[0, 0]) < 0.05 * float(aerial.covariance_m2[0, 0])
-    np.testing.assert_allclose(both.position_m[:2], SOURCE[:2], atol=0.02)
-    np.testing.assert_allclose(both.position_m[2], SOURCE[2], atol=0.5 * float(jnp.sqrt(both.covariance_m2[2, 2])))
-    np.testing.assert_allclose(both.activity_bq, ACTIVITY, rtol=0.01)
+def test_ground_data_sharpen_the_aerial_estimate(localiser):
+    m = counted(BOTH, mean_rois(SITE, DETECTORS, BOTH, CO_60))
+    both, aerial = localiser(m).fits, localiser(replace(m, valid=AERIAL.valid)).fits
+    assert float(both.covariance_m2[0, 0, 0]) < 0.05 * float(aerial.covariance_m2[0, 0, 0])
+    np.testing.assert_allclose(both.position_m[0, :2], SOURCE[:2], atol=0.02)
+    np.testing.assert_allclose(both.position_m[0, 2], SOURCE[2], atol=0.5 * sigma(both)[2])
+    np.testing.assert_allclose(both.activity_bq[0], ACTIVITY, rtol=0.01)
 
 
-def test_two_sources_one_after_the_other():
-    site, d, flight = place(), (detector(),), survey(altitude=12.0, count=300)
-    truth = [(jnp.array([30.0, -25.0, 1.0]), 300e6), (jnp.array([-30.0, 20.0, 1.0]), 150e6)]
-    m = draw(flight, mean_rates(site, d, flight, truth), 7)
-    first = jnp.array([[28.0, -22.0], [34.0, -20.0]])
-    second = jnp.array([[-27.0, 22.0], [-33.0, 25.0]])
-    extra = jnp.zeros(300)
-    rates = jax.jit(partial(net_rates, site, d))
-    for _ in range(3):  # each in turn with the other's rate known: coordinate ascent of the joint likelihood
-        strong = _localise(site, d, m, first, NUCLIDE, QUICK, extra)
-        weak = _localise(site, d, m, second, NUCLIDE, QUICK, strong.activity_bq * rates(m, strong.position_m, NUCLIDE))
-        extra = weak.activity_bq * rates(m, weak.position_m, NUCLIDE)
-    for fit, (position, activity) in zip((strong, weak), truth, strict=True):
-        sigma = np.sqrt(np.diag(fit.covariance_m2))[:2]
-        assert np.all(np.abs(np.asarray(fit.position_m - position)[:2]) < 4.0 * sigma)
-        assert abs(float(fit.activity_bq) - activity) < 4.0 * float(fit.activity_std_bq)
-        assert bool(detected(fit, 5.0))
-
-
-def test_padding_and_repetition_change_nothing():
-    site, d, flight = place(), (detector(),), survey(count=300)
-    m = draw(flight, mean_rates(site, d, flight, [(SOURCE, ACTIVITY)]), 5)
-    m = replace(m, valid=m.valid.at[250:].set(False))
+def test_padding_and_repetition_change_nothing(localiser):
+    m = drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, CO_60), 5)
+    m = replace(m, valid=m.valid & (jnp.arange(360) < 250))
     spoilt = replace(
         m,
         counts=m.counts.at[250:].set(jnp.nan),
+        rois=m.rois.at[250:].set(jnp.nan),
         position_m=m.position_m.at[250:].set(jnp.nan),
         exposure_s=m.exposure_s.at[250:].set(1e9),
         detector=m.detector.at[250:].set(9),
     )
-    one, again, other = (_localise(site, d, v, STARTS, NUCLIDE, QUICK) for v in (m, m, spoilt))
+    one, again, other = (localiser(v) for v in (m, m, spoilt))
     for a, b, c in zip(*(jax.tree.leaves(v) for v in (one, again, other)), strict=True):
         np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(a, c)
-    shorter = _localise(site, d, jax.tree.map(lambda a: a[:250], m), STARTS, NUCLIDE, QUICK)
-    np.testing.assert_allclose(one.position_m, shorter.position_m, atol=0.02)
-    np.testing.assert_allclose(one.detection, shorter.detection, rtol=1e-3)
-
-
-def test_a_mission_of_a_batch_equals_itself_alone():
-    site, d, flight = place(), (detector(),), survey(count=300)
-    rates = mean_rates(site, d, flight, [(SOURCE, ACTIVITY)])
-    batch = jax.vmap(lambda k: draw(flight, rates, k))(jax.random.split(jax.random.key(6), 3))
-    together = jax.jit(jax.vmap(lambda m: localise(site, d, m, STARTS, NUCLIDE, QUICK)))(batch)
-    alone = _localise(site, d, jax.tree.map(lambda a: a[1], batch), STARTS, NUCLIDE, QUICK)
-    np.testing.assert_allclose(together.position_m[1], alone.position_m, atol=0.02)
-    np.testing.assert_allclose(together.activity_bq[1], alone.activity_bq, rtol=2e-3)
 
 
 @pytest.mark.parametrize("case", ["no samples", "no counts", "outside"])
-def test_useless_data_give_a_finite_answer_that_is_no_detection(case):
-    site, d, m = place(), (detector(),), survey(count=300)
+def test_useless_data_give_a_finite_answer_that_is_no_detection(localiser, case):
+    far = replace(AERIAL, position_m=AERIAL.position_m + jnp.array([900.0, 0.0, 0.0]))
+    background = mean_rois(SITE, DETECTORS, AERIAL)
     m = {
-        "no samples": replace(m, valid=jnp.zeros(300, bool)),
-        "no counts": m,
-        "outside": draw(replace(m, position_m=m.position_m + jnp.array([900.0, 0.0, 0.0])), jnp.full(300, 94.0), 1),
+        "no samples": replace(counted(AERIAL, background), valid=jnp.zeros(360, bool)),
+        "no counts": counted(AERIAL, jnp.zeros_like(background)),
+        "outside": drawn(far, background, 1),
     }[case]
-    fit = _localise(site, d, m, STARTS, NUCLIDE, QUICK)
-    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(fit))
-    assert not bool(detected(fit, 5.0))
-    assert np.all(np.abs(np.asarray(fit.position_m)[:2]) <= 90.0)
+    estimated = localiser(m)
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(estimated.fits))
+    assert not np.any(estimated.fits.present)
+    assert np.all(np.abs(np.asarray(estimated.fits.position_m)[:, :2]) <= 90.0)

@@ -1,4 +1,4 @@
-"""The sampled posterior against its integral on a grid, in the open and beside a wall."""
+"""The sampled posterior against closed forms, and against its integral on a grid, in the open and beside a wall."""
 
 from dataclasses import replace
 
@@ -6,85 +6,153 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from swarmsim.estimation.likelihood import FitProblem, evaluate, scaled_inverse
-from swarmsim.estimation.posterior import sample_posterior
-from swarmsim.estimation.search import background_only, best_at, bounds
-from tests.estimation.survey import NUCLIDE, detector, draw, mean_rates, place, survey
+from swarmsim.config.mission import Knowledge
+from swarmsim.estimation.localise import problem_of
+from swarmsim.estimation.posterior import WEIGH_STEPS, Weighed, posteriors, sample_posterior
+from swarmsim.estimation.search import STEPS, attempt
+from swarmsim.estimation.sources import Sources, no_sources
+from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey
 
-SOURCE, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
-THETA = jnp.array([12.0, 4.0, 1.0, jnp.log(ACTIVITY), 0.0])
+AT, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
 WALLS = [((9.5, 4.0, 1.5), (0.05, 4.0, 1.5), "concrete"), ((12.0, 6.2, 1.5), (2.5, 0.05, 1.5), "concrete")]
-
-
-def problem_of(boxes, seed):
-    """What a survey of 231 windows at 12 m tells of a source whose height is known."""
-    site, d, flight = place(boxes), (detector(),), survey(altitude=12.0, count=231)
-    m = draw(flight, mean_rates(site, d, flight, [(SOURCE, ACTIVITY)]), seed)
-    m = jax.tree.map(lambda leaf: leaf[jnp.argsort(m.position_m[:, 2])], m)
-    return FitProblem(
-        site=site, detectors=d, measurements=m, nuclide=NUCLIDE, natural=jnp.ones(231), extra_cps=jnp.zeros(231),
-        height_m=jnp.float32(1.0), height_std_m=jnp.float32(1e-3), rays=1,
-    )  # fmt: skip
+SPANS = ((0, 231, 0),)
+CO_60 = jnp.int32(0)
 
 
 @jax.jit
-def _sample(problem, start):
-    log_scale, _ = background_only(problem)
-    covariance = scaled_inverse(evaluate(problem, THETA).information)
-    return sample_posterior(problem, bounds(problem), start, covariance, log_scale, 6, 64)
+def _of_a_normal(mean, covariance, slope, variance, start, guess):
+    """Moments where the posterior of the place is normal, and the activity's logarithm linear in the place."""
+    inverse = jnp.linalg.inv(covariance)
+
+    def weigh(x):
+        offset = x - mean
+        return Weighed(
+            place=x, log_activity=slope @ offset, variance=variance, log_posterior=-0.5 * offset @ inverse @ offset
+        )
+
+    return sample_posterior(weigh, start, guess, 6, 64)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**31), wrong=st.floats(0.5, 2.0))
+def test_a_normal_posterior_has_its_mean_and_covariance(seed, wrong):
+    rng = np.random.default_rng(seed)
+    root = np.diag(10.0 ** rng.uniform(-1.0, 1.0, 3)) @ (np.eye(3) + 0.4 * np.tril(rng.normal(size=(3, 3)), -1))
+    covariance, mean, slope = root @ root.T, rng.uniform(-50.0, 50.0, 3), rng.normal(size=3)
+    start = mean + root @ rng.uniform(-0.7, 0.7, 3)
+    f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    found = _of_a_normal(f32(mean), f32(covariance), f32(slope), f32(0.09), f32(start), f32(wrong**2 * covariance))
+    std = np.sqrt(np.diag(covariance))
+    assert np.all(np.abs(np.asarray(found.mean)[:3] - mean) < 0.15 * std)
+    relative = np.asarray(found.covariance)[:3, :3] / np.outer(std, std)
+    np.testing.assert_allclose(relative, covariance / np.outer(std, std), atol=0.25)
+    spread = float(slope @ covariance @ slope) + 0.09
+    np.testing.assert_allclose(found.covariance[3, 3], spread, rtol=0.3)
+    assert abs(float(found.mean[3])) < 0.15 * np.sqrt(spread)
+    assert float(found.effective) > 64.0
+    assert float(found.halves) < 0.4
+
+
+def test_two_halves_that_disagree_are_told():
+    """All of the posterior in a hair's breadth far from the start: the few places that come near it settle nothing."""
+
+    def weigh(x):
+        far = -0.5 * jnp.sum(jnp.square((x - 2.5) / 0.02))
+        return Weighed(place=x, log_activity=x[0], variance=jnp.float32(0.01), log_posterior=far)
+
+    found = jax.jit(lambda: sample_posterior(weigh, jnp.zeros(3), jnp.eye(3), 1, 64))()
+    assert float(found.effective) < 16.0
+
+
+def told(boxes, seed):
+    """What a survey of 231 windows at 12 m tells of a source whose height is known, and a state with that source."""
+    site, flight = place(boxes), survey(altitude=12.0, count=231)
+    certain = Knowledge(site="exact", background_std=0.05, model_std=0.01)
+    known = presumed(site, (detector(),), knowledge=certain, height_std_m=1e-3)
+    problem = problem_of(known, drawn_of_one(site, detector(), flight, AT, ACTIVITY, seed), SPANS, 1)
+    return problem, _state(problem, AT)
 
 
 @jax.jit
-def _grid(problem, places):
-    log_scale, _ = background_only(problem)
-    return jax.lax.map(lambda p: best_at(problem, p, log_scale)[:2], places)
+def _state(problem, at):
+    nothing = no_sources(problem, 1, 1)
+    u = replace(nothing.unknowns, activity_bq=jnp.float32(ACTIVITY))
+    fit = attempt(problem, CO_60, nothing.added, u, at, STEPS, True).fit
+    sources = Sources(
+        place=at[None],
+        nuclide=CO_60[None],
+        activity_bq=fit.unknowns.activity_bq[None],
+        present=jnp.ones(1, bool),
+        nuclide_value=jnp.zeros((1, 1)),
+        towards=fit.towards[None],
+    )
+    counts = fit.unknowns.activity_bq * fit.net
+    unknowns = replace(fit.unknowns, activity_bq=jnp.zeros(()))
+    added = replace(nothing.added, counts=counts[None])
+    return replace(nothing, sources=sources, added=added, unknowns=unknowns, likelihood=fit.likelihood)
 
 
-def integral(problem):
-    """Mean [5] and standard deviations [5] of the posterior on a grid of 0.15 m (activity: of the best ones alone)."""
-    x, y = np.meshgrid(np.arange(8.0, 16.51, 0.15), np.arange(0.0, 8.51, 0.15))
+@jax.jit
+def _sample(problem, state):
+    return jax.tree.map(lambda x: x[0], posteriors(problem, state, 6, 64)[0])
+
+
+@jax.jit
+def _grid(problem, state, places):
+    nothing = no_sources(problem, 1, 1).added
+    u = replace(state.unknowns, activity_bq=state.sources.activity_bq[0])
+
+    def one(at):
+        fit = attempt(problem, CO_60, nothing, u, at, WEIGH_STEPS, False).fit
+        return jnp.append(at, jnp.log(fit.unknowns.activity_bq)), fit.value, fit.covariance[0, 0]
+
+    return jax.lax.map(one, places)
+
+
+def integral(problem, state, reach):
+    """Mean [4] and standard deviations [4] of the posterior on a grid [35, 35] of so many metres to each side."""
+    x, y = np.meshgrid(12.0 + np.linspace(-reach, reach, 35), 4.0 + np.linspace(-reach, reach, 35))
     places = jnp.asarray(np.stack([x.ravel(), y.ravel(), np.ones(x.size)], -1), jnp.float32)
-    theta, value = (np.asarray(v, np.float64) for v in _grid(problem, places))
+    theta, value, own = (np.asarray(v, np.float64) for v in _grid(problem, state, places))
     weight = np.exp(value - value.max())
     weight /= weight.sum()
+    assert weight.reshape(35, 35)[[0, -1]].sum() + weight.reshape(35, 35)[:, [0, -1]].sum() < 0.02
     mean = weight @ theta
-    return mean, np.sqrt(weight @ (theta - mean) ** 2)
+    variance = weight @ (theta - mean) ** 2
+    variance[3] += weight @ own
+    return mean, np.sqrt(variance)
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("boxes", [[], WALLS], ids=["open", "walls"])
-def test_moments_are_those_of_the_integral(boxes, seed):
-    problem = problem_of(boxes, seed)
-    mean, std = integral(problem)
-    found = _sample(problem, THETA)
+@pytest.mark.parametrize(("boxes", "reach", "near"), [([], 4.5, 0.15), (WALLS, 1.7, 0.4)], ids=["open", "walls"])
+def test_moments_are_those_of_the_integral(boxes, reach, near, seed):
+    problem, state = told(boxes, seed)
+    mean, std = integral(problem, state, reach)
+    found = _sample(problem, state)
     sampled = np.sqrt(np.diag(found.covariance))
-    assert np.all(np.abs(np.asarray(found.mean)[:2] - mean[:2]) < 0.15 * std[:2])
-    assert abs(float(found.mean[3]) - mean[3]) < 0.15 * float(sampled[3])
+    assert np.all(np.abs(np.asarray(found.mean)[:2] - mean[:2]) < near * std[:2])
+    assert abs(float(found.mean[3]) - mean[3]) < near * float(sampled[3])
     np.testing.assert_allclose(sampled[:2], std[:2], rtol=0.2)
+    np.testing.assert_allclose(sampled[3], std[3], rtol=0.15)
     assert float(found.effective) > 16.0
 
 
 def test_the_mean_does_not_depend_on_where_sampling_starts():
-    problem = problem_of(WALLS, 1)
-    std = integral(problem)[1][:2]
+    problem, state = told(WALLS, 1)
+    std = integral(problem, state, 1.7)[1][:2]
     means = [
-        _sample(problem, THETA + jnp.array([dx, dy, 0, 0, 0])).mean[:2] for dx, dy in ((0, 0), (0.5, -0.4), (-0.6, 0.2))
+        _sample(problem, _state(problem, AT + jnp.array([dx, dy, 0.0]))).mean[:2]
+        for dx, dy in ((0, 0), (0.5, -0.4), (-0.6, 0.2))
     ]
-    assert np.all(np.ptp(np.asarray(means), axis=0) < 0.3 * std)
-
-
-def test_activity_spread_includes_its_own_at_each_place():
-    """On open ground it is that of the information, of which the place's part is less than half."""
-    problem = problem_of([], 0)
-    found = _sample(problem, THETA)
-    expected = np.sqrt(np.asarray(scaled_inverse(evaluate(problem, THETA).information))[3, 3])
-    np.testing.assert_allclose(np.sqrt(found.covariance[3, 3]), expected, rtol=0.15)
+    assert np.all(np.ptp(np.asarray(means), axis=0) < 0.4 * std)
 
 
 def test_without_any_measurement_the_moments_are_finite():
-    problem = problem_of([], 0)
+    problem, state = told([], 0)
     m = problem.measurements
     nothing = replace(problem, measurements=replace(m, valid=jnp.zeros_like(m.valid)))
-    found = _sample(nothing, THETA)
+    found = _sample(nothing, state)
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(found))

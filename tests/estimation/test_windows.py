@@ -9,7 +9,7 @@ import pytest
 
 from swarmsim.estimation import aggregate
 from swarmsim.estimation.measurements import Measurements
-from swarmsim.estimation.windows import gather, measured, windows_start
+from swarmsim.estimation.windows import gather, measured, merged, windows_start
 
 FRAMES, VEHICLES, PER_WINDOW = 60, 3, 7
 add = jax.jit(gather, static_argnames="per_window")
@@ -117,3 +117,40 @@ def test_missions_of_a_batch_have_their_own_windows():
         alone = add(start, one, fresh, per_window=PER_WINDOW)
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[number], b, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("most", [1, 2, 4, 8])
+def test_windows_are_put_together_until_they_fit(most):
+    taken, new = samples(3)
+    windows = add(windows_start(VEHICLES, 12, ROIS), taken, new.at[20:, 1].set(False), per_window=PER_WINDOW)
+    used = np.asarray(windows.exposure_s > 0.0).sum(axis=1)
+    few = merged(windows, most)
+    assert few.counts.shape == (VEHICLES, most)
+    for name in ("counts", "exposure_s", "rois", "travel_m", "position_m", "axis"):
+        whole, parts = (np.asarray(getattr(w, name)).sum(axis=1) for w in (windows, few))
+        np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-2, err_msg=name)
+    np.testing.assert_array_equal(few.samples, windows.samples)
+    for vehicle in range(VEHICLES):
+        together = -(-used[vehicle] // most)
+        time = np.asarray(few.time_s)[vehicle]
+        left = -(-used[vehicle] // together)
+        # neighbours in their order: each ends with the last of so many windows
+        ends = np.minimum(np.arange(1, left + 1) * together, used[vehicle]) - 1
+        np.testing.assert_array_equal(time[:left], np.asarray(windows.time_s)[vehicle, ends])
+        np.testing.assert_array_equal(np.asarray(few.exposure_s)[vehicle] > 0.0, np.arange(most) < left)
+        counts = np.asarray(windows.counts)[vehicle, : used[vehicle]]
+        np.testing.assert_allclose(
+            np.asarray(few.counts)[vehicle, :left], np.add.reduceat(counts, np.arange(0, used[vehicle], together))
+        )
+
+
+@pytest.mark.parametrize("most", [9, 12, 20])
+def test_windows_that_fit_stay_as_they_are(most):
+    taken, new = samples(4)
+    windows = add(windows_start(VEHICLES, 12, ROIS), taken, new, per_window=PER_WINDOW)
+    assert int((windows.exposure_s > 0.0).sum(axis=1).max()) <= 9
+    few = merged(windows, most)
+    kept = min(most, 12)
+    for name in ("time_s", "position_m", "travel_m", "axis", "counts", "exposure_s", "rois"):
+        np.testing.assert_array_equal(getattr(few, name)[:, :kept], getattr(windows, name)[:, :kept], err_msg=name)
+        assert not np.any(getattr(few, name)[:, kept:])

@@ -1,0 +1,136 @@
+"""The model of counts by region of interest and its fit at one place, against closed forms and the simulated truth."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarmsim.config.mission import Knowledge
+from swarmsim.estimation.localise import problem_of
+from swarmsim.estimation.model import dead_time, settle, spans_of, ways_from
+from swarmsim.estimation.scan import scan
+from swarmsim.estimation.sources import no_sources, without_more
+from swarmsim.radiation import observed_rate
+from tests.estimation.survey import NUCLIDES, counted, mean_rois, place, presumed, spectrometer, survey, windows
+
+WALL = [((4.0, 0.0, 2.0), (0.15, 8.0, 2.0), "concrete")]
+DETECTORS = (spectrometer(),)
+FLIGHT = survey(altitude=12.0, count=120, half=40.0, lines=8)
+SPANS = ((0, 120, 0),)
+BACKGROUND = 1.1
+
+
+def told(site, sources, knowledge=None, background=BACKGROUND, flight=FLIGHT):
+    """What is presumed, and the noiseless counts of a survey."""
+    m = counted(flight, mean_rois(site, DETECTORS, flight, sources, background))
+    return presumed(site, DETECTORS, half=40.0, knowledge=knowledge), m
+
+
+@jax.jit
+def _settled(known, m, at, nuclide):
+    problem = problem_of(known, m, SPANS, 1)
+    nothing = no_sources(problem, 1, len(NUCLIDES))
+    others, unknowns = nothing.added, nothing.unknowns
+    alone = without_more(problem, others, unknowns, 4)[1]
+    return settle(problem, ways_from(problem, at), nuclide, others, unknowns, 8, True), alone
+
+
+@pytest.mark.parametrize("boxes", [[], WALL], ids=["open", "wall"])
+@pytest.mark.parametrize("name", ["Co-60", "Cs-137", "Ba-133"])
+def test_expected_counts_at_the_true_place_give_the_truth(boxes, name):
+    rng = np.random.default_rng(len(boxes) + NUCLIDES.index(name))
+    site = place(boxes, half=40.0)
+    for _ in range(3):
+        at, activity = np.append(rng.uniform(-25.0, 25.0, 2), 1.0), 10.0 ** rng.uniform(8.5, 9.2)
+        known, m = told(site, [(at, activity, name)], Knowledge(site="geometry"))
+        fit = _settled(known, m, jnp.asarray(at, jnp.float32), jnp.int32(NUCLIDES.index(name)))[0]
+        u = fit.unknowns
+        np.testing.assert_allclose(u.activity_bq, activity, rtol=0.01)
+        np.testing.assert_allclose(u.lengths, 0.0, atol=0.02)
+        np.testing.assert_allclose(jnp.exp(u.level), BACKGROUND, rtol=0.003)
+        np.testing.assert_allclose(u.background, 0.0, atol=0.02)
+        np.testing.assert_allclose(u.gain, 0.0, atol=0.02)
+        assert abs(float(fit.likelihood)) < 0.5
+
+
+def test_a_wrong_nuclide_at_the_true_place_explains_the_counts_less():
+    known, m = told(place(half=40.0), [((5.0, 3.0, 1.0), 500e6, "Cs-137")])
+    values = [
+        float(_settled(known, m, jnp.array([5.0, 3.0, 1.0]), jnp.int32(k))[0].value) for k in range(len(NUCLIDES))
+    ]
+    assert np.argmax(values) == NUCLIDES.index("Cs-137")
+    assert np.sort(values)[-1] - np.sort(values)[-2] > 10.0
+
+
+@jax.jit
+def _scanned(known, m, point):
+    problem = problem_of(known, m, SPANS, 1)
+    nothing = no_sources(problem, 1, len(NUCLIDES))
+    u, _ = without_more(problem, nothing.added, nothing.unknowns, 4)
+    return [scan(problem, point[None], jnp.arange(len(NUCLIDES)) == k, nothing.added, u) for k in range(len(NUCLIDES))]
+
+
+def cone(at):
+    """Windows at several heights above a place, all seen at the angle for which the scan has its rates."""
+    turn, up = np.linspace(0.0, 6.0 * np.pi, 120), np.tile(np.geomspace(3.0, 50.0, 12), 10)
+    return windows(np.asarray(at) + np.stack([up * np.cos(turn), up * np.sin(turn), up], axis=-1))
+
+
+@pytest.mark.parametrize("name", ["Co-60", "Cs-137", "I-131"])
+@pytest.mark.parametrize(("flight", "tolerance"), [(cone, 0.008), (lambda at: FLIGHT, 0.03)], ids=["angle", "survey"])
+def test_the_score_of_a_weak_source_is_the_likelihood_ratio_and_a_squared_information(name, flight, tolerance):
+    """s^2 / I = A^2 I where s = A I; noiseless counts of a source far below the background.
+
+    The scan knows the rates at one angle to the crystal's axis, which is what the larger tolerance of a survey is for.
+    """
+    k = NUCLIDES.index(name)
+    rng = np.random.default_rng(k)
+    site = place(half=40.0)
+    for _ in range(3):
+        at = np.append(rng.uniform(-20.0, 20.0, 2), 1.0)
+        m = flight(at)
+        share = mean_rois(site, DETECTORS, m, [(at, 1e6, name)]) / mean_rois(site, DETECTORS, m)
+        activity = 0.03 * 1e6 / float(jnp.max(share) - 1.0)
+        known, m = told(site, [(at, activity, name)], flight=m)
+        found = _scanned(known, m, jnp.asarray(at, jnp.float32))[k]
+        fit, alone = _settled(known, m, jnp.asarray(at, jnp.float32), jnp.int32(k))
+        ratio = 2.0 * float(fit.likelihood - alone)
+        information = float(found.statistic[0]) / float(found.activity_bq[0]) ** 2
+        assert int(found.nuclide[0]) == k
+        np.testing.assert_allclose(found.activity_bq[0], activity, rtol=tolerance)
+        np.testing.assert_allclose(activity**2 * information, ratio, rtol=2.0 * tolerance)
+        np.testing.assert_allclose(found.statistic[0], ratio, rtol=0.01)
+
+
+def test_without_a_source_the_score_is_nothing_anywhere():
+    known, m = told(place(half=40.0), [])
+    for k, found in enumerate(_scanned(known, m, jnp.array([3.0, -8.0, 1.0]))):
+        assert int(found.nuclide[0]) == k
+        assert abs(float(found.statistic[0])) < 0.01
+
+
+@given(st.lists(st.floats(0.0, 3e5), min_size=4, max_size=4), st.floats(0.0, 1e-5), st.floats(0.0, 1e-5))
+def test_dead_time_is_that_of_the_detector(rates, paralyzable, non_paralyzable):
+    d = replace(DETECTORS[0], paralyzable_s=jnp.float32(paralyzable), non_paralyzable_s=jnp.float32(non_paralyzable))
+    known, m = told(place(half=40.0), [])
+    exposure = jnp.where(jnp.arange(120) % 2 == 0, 0.5, 3.0)
+    problem = problem_of(known, replace(m, exposure_s=exposure), SPANS, 1)
+    problem = replace(problem, detectors=(d,))
+    rate = jnp.resize(jnp.asarray(rates, jnp.float32), 120)
+    share, slope = dead_time(problem, rate * exposure)
+    np.testing.assert_allclose(share * rate, observed_rate(d, rate - d.background_cps), rtol=1e-4, atol=1e-3)
+    exact = jax.vmap(jax.grad(lambda n, t: share_of(d, n / t)))(rate * exposure, exposure)
+    np.testing.assert_allclose(slope, exact, rtol=1e-3, atol=1e-12)
+
+
+def share_of(d, rate):
+    return jnp.exp(-rate * d.paralyzable_s) / (1.0 + rate * d.non_paralyzable_s)
+
+
+def test_spans_join_neighbours_of_one_detector():
+    assert spans_of([(10, 0), (5, 0), (0, 1), (7, 1), (3, 0)]) == ((0, 15, 0), (15, 22, 1), (22, 25, 0))
+    assert spans_of([]) == ()

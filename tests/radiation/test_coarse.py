@@ -1,0 +1,101 @@
+"""Detectors for estimates: rates by region and their slopes, and tables of few lines against those of all."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.radiation import Detector
+from swarmsim.radiation.coarse import coarse
+from swarmsim.radiation.detector import Source
+from swarmsim.radiation.rate import roi_rates, roi_rates_and_slopes
+from swarmsim.site import Crossed
+
+Detectors = dict[tuple[str, str], Detector]
+MATERIALS = ("air", "concrete", "steel")
+LINES = 8  # as the localisation has
+
+
+def ways(detector: Detector, seed: int, count: int, walls: float = 0.3) -> tuple[Crossed, jax.Array, jax.Array]:
+    """Drawn places around a source at the origin, seen through air and up to so much concrete."""
+    rng = np.random.default_rng(seed)
+    place = rng.normal(size=(count, 3))
+    place *= rng.uniform(3.0, 60.0, (count, 1)) / np.linalg.norm(place, axis=1, keepdims=True)
+    axis = rng.normal(size=(count, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    length = np.zeros((count, len(detector.material_names)))
+    length[:, detector.material_names.index("air")] = np.linalg.norm(place, axis=1)
+    length[:, detector.material_names.index("concrete")] = rng.uniform(0.0, walls, count)
+    between = rng.uniform(0.05, 0.95, length.shape)
+    f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    return Crossed(length_m=f32(length), place=f32(between)), f32(place), f32(axis)
+
+
+def stretched(way: Crossed, material: int, factor: float) -> Crossed:
+    return Crossed(length_m=way.length_m.at[:, material].mul(factor), place=way.place)
+
+
+def source(nuclide: int) -> Source:
+    return Source(position_m=jnp.zeros(3), activity_bq=jnp.float32(1e8), nuclide=jnp.int32(nuclide))
+
+
+@jax.jit
+def _each(detector: Detector, nuclide: jax.Array, way: Crossed, place: jax.Array, axis: jax.Array) -> jax.Array:
+    one = Source(position_m=jnp.zeros(3), activity_bq=jnp.float32(1e8), nuclide=nuclide)
+    return jax.vmap(lambda w, p, a: roi_rates(detector, one, w, p, a))(way, place, axis)
+
+
+_with_slopes = jax.jit(roi_rates_and_slopes)
+
+
+@pytest.mark.parametrize("kind", ["physical", "paper_ideal"])
+@pytest.mark.parametrize("name", ["Co-60", "Cs-137", "Ba-133", "Am-241"])
+def test_rates_with_slopes_are_the_rates_and_slopes_their_differences(
+    detectors: Detectors, kind: str, name: str
+) -> None:
+    d = detectors["nai_1p5x1p5", kind]
+    k = d.nuclide_names.index(name)
+    way, place, axis = ways(d, k, 24)
+    rates, slopes = (np.asarray(x, float) for x in _with_slopes(d, source(k), way, place, axis))
+    np.testing.assert_allclose(rates, _each(d, jnp.int32(k), way, place, axis), rtol=2e-4, atol=1e-6 * rates.max())
+    columns, step = [d.material_names.index(name) for name in ("air", "concrete")], 0.05
+    up, down = (
+        np.stack([_each(d, jnp.int32(k), stretched(way, m, np.exp(s)), place, axis) for m in columns], axis=1)
+        for s in (step, -step)
+    )
+    difference = (up - down) / (2.0 * step)
+    # of the largest: that the spectrum softens with depth is left out
+    assert np.max(np.abs(slopes[:, columns] - difference)) <= 0.15 * np.max(np.abs(difference))
+
+
+def test_few_lines_keep_the_counts_of_every_nuclide_behind_concrete(detectors: Detectors) -> None:
+    full = detectors["nai_1p5x1p5", "physical"]
+    few = coarse(full, LINES, MATERIALS)
+    assert few.material_names == MATERIALS
+    assert few.yields.shape == (len(full.nuclide_names), LINES)
+    columns = jnp.array([full.material_names.index(name) for name in MATERIALS])
+    way, place, axis = ways(full, 0, 200)
+    less = Crossed(length_m=way.length_m[:, columns], place=way.place[:, columns])
+    worst = {}
+    for k, name in enumerate(full.nuclide_names):
+        exact, found = (
+            np.asarray(_each(d, jnp.int32(k), w, place, axis), float).sum(axis=1) for d, w in ((full, way), (few, less))
+        )
+        worst[name] = float(np.max(np.abs(found / exact - 1.0)))
+    assert max(worst.values()) < 0.06, worst
+    assert worst["Pu-239"] > 1e-3  # its lines are put together: the test could tell
+
+
+def test_a_nuclide_with_few_lines_keeps_its_tables(detectors: Detectors) -> None:
+    full = detectors["nai_1p5x1p5", "physical"]
+    few = coarse(full, LINES, full.material_names)
+    for name in ("Co-60", "Cs-137"):
+        k = full.nuclide_names.index(name)
+        way, place, axis = ways(full, k, 20)
+        exact, found = (np.asarray(_each(d, jnp.int32(k), way, place, axis), float) for d in (full, few))
+        np.testing.assert_allclose(found, exact, rtol=0.01, atol=1e-3 * exact.max())
+
+
+def test_materials_without_a_table_are_refused(detectors: Detectors) -> None:
+    with pytest.raises(ValueError, match="not in tuple"):
+        coarse(detectors["nai_1p5x1p5", "physical"], LINES, ("air", "unobtainium"))
