@@ -258,7 +258,8 @@ def _best(
     adding: jax.Array,
 ) -> tuple[Tried, jax.Array, jax.Array]:
     """The best place from some grid points, or from where the source is; its nuclide, and the value of each [N]."""
-    s, most = state.sources, allowed.shape[0]
+    s, known = state.sources, allowed.shape[0]
+    most = max(known, STARTS + 1)
     u = replace(state.unknowns, activity_bq=jnp.where(adding, 0.0, s.activity_bq[slot]))
     far = -(-params.screened // SCREENED)
     # the first round fits the starts, and one in between the nuclides at the best place
@@ -287,6 +288,7 @@ def _best(
     def name(best: Tried) -> Asked:
         everyone = jnp.argsort(~allowed).astype(jnp.int32)  # the allowed ones first
         places = jnp.broadcast_to(best.place, (most, 3))
+        everyone = jnp.pad(everyone, (0, most - known))
         return Asked(place=places, nuclide=everyone, fresh=jnp.ones(most, bool), count=jnp.sum(allowed))
 
     Carry = tuple[Tried, jax.Array, jax.Array]
@@ -311,11 +313,11 @@ def _best(
         start = jax.tree.map(partial(jnp.where, which == 0), u, best.fit.unknowns)
         best, chosen, found = answered(problem, others, start, asked, before, STEPS)
         named = (which == 1) & ~skipped
-        table = jnp.full(most, -jnp.inf).at[asked.nuclide].set(found)
+        table = jnp.full(known, -jnp.inf).at[asked.nuclide].max(found)
         nuclide = jnp.where(chosen >= 0, asked.nuclide[jnp.maximum(chosen, 0)], nuclide)
         return (best, nuclide, jnp.where(named, table, values)), None
 
-    carry: Carry = (_nowhere(problem, u), s.nuclide[slot], jnp.zeros(most))
+    carry: Carry = (_nowhere(problem, u), s.nuclide[slot], jnp.zeros(known))
     return jax.lax.scan(round_, carry, (jnp.arange(reaches.shape[0]), reaches))[0]
 
 

@@ -16,7 +16,7 @@ NOWHERE = [((-85.0, -85.0, 0.0), (0.01, 0.01, 0.01), "concrete")] * 2  # as many
 FLIGHT, DRIVE = survey(count=300), orbit((12.0, 4.0), 7.0, 60)
 BOTH = concatenate(FLIGHT, DRIVE)
 AERIAL = replace(BOTH, valid=BOTH.detector == 0)
-SPANS = ((0, 300, 0), (300, 360, 1))
+SPANS = ((0, 300, 0, 1), (300, 360, 1, 1))
 
 
 class Localiser:
@@ -27,7 +27,7 @@ class Localiser:
         self.presumed = presumed(self.site, DETECTORS)
         self.params = localisation_params(spec())
         empty = counted(AERIAL, jnp.zeros((360, DETECTORS[0].background_rois.shape[0])))
-        self.nothing = no_sources(problem_of(self.presumed, empty, SPANS, 1), spec().sources_max, len(NUCLIDES))
+        self.nothing = no_sources(problem_of(self.presumed, empty, SPANS), spec().sources_max, len(NUCLIDES))
         program = jax.jit(localise, static_argnames="spans")
         self.program = program.lower(self.presumed, empty, SPANS, self.params, self.nothing).compile()
 

@@ -20,7 +20,7 @@ from tests.estimation.survey import NUCLIDES, counted, mean_rois, place, presume
 WALL = [((4.0, 0.0, 2.0), (0.15, 8.0, 2.0), "concrete")]
 DETECTORS = (spectrometer(),)
 FLIGHT = survey(altitude=12.0, count=120, half=40.0, lines=8)
-SPANS = ((0, 120, 0),)
+SPANS = ((0, 120, 0, 1),)
 BACKGROUND = 1.1
 
 
@@ -32,7 +32,7 @@ def told(site, sources, knowledge=None, background=BACKGROUND, flight=FLIGHT):
 
 @jax.jit
 def _settled(known, m, at, nuclide):
-    problem = problem_of(known, m, SPANS, 1)
+    problem = problem_of(known, m, SPANS)
     nothing = no_sources(problem, 1, len(NUCLIDES))
     others, unknowns = nothing.added, nothing.unknowns
     alone = without_more(problem, others, unknowns, 4)[1]
@@ -68,7 +68,7 @@ def test_a_wrong_nuclide_at_the_true_place_explains_the_counts_less():
 
 @jax.jit
 def _scanned(known, m, point):
-    problem = problem_of(known, m, SPANS, 1)
+    problem = problem_of(known, m, SPANS)
     nothing = no_sources(problem, 1, len(NUCLIDES))
     u, _ = without_more(problem, nothing.added, nothing.unknowns, 4)
     return [scan(problem, point[None], jnp.arange(len(NUCLIDES)) == k, nothing.added, u) for k in range(len(NUCLIDES))]
@@ -118,7 +118,7 @@ def test_dead_time_is_that_of_the_detector(rates, paralyzable, non_paralyzable):
     d = replace(DETECTORS[0], paralyzable_s=jnp.float32(paralyzable), non_paralyzable_s=jnp.float32(non_paralyzable))
     known, m = told(place(half=40.0), [])
     exposure = jnp.where(jnp.arange(120) % 2 == 0, 0.5, 3.0)
-    problem = problem_of(known, replace(m, exposure_s=exposure), SPANS, 1)
+    problem = problem_of(known, replace(m, exposure_s=exposure), SPANS)
     problem = replace(problem, detectors=(d,))
     rate = jnp.resize(jnp.asarray(rates, jnp.float32), 120)
     share, slope = dead_time(problem, rate * exposure)
@@ -131,6 +131,8 @@ def share_of(d, rate):
     return jnp.exp(-rate * d.paralyzable_s) / (1.0 + rate * d.non_paralyzable_s)
 
 
-def test_spans_join_neighbours_of_one_detector():
-    assert spans_of([(10, 0), (5, 0), (0, 1), (7, 1), (3, 0)]) == ((0, 15, 0), (15, 22, 1), (22, 25, 0))
+def test_spans_join_neighbours_of_one_detector_and_as_many_rays():
+    assert spans_of([(10, 0, 1), (5, 0, 1), (0, 1, 3), (7, 1, 3), (3, 0, 3), (2, 0, 1)]) == (
+        (0, 15, 0, 1), (15, 22, 1, 3), (22, 25, 0, 3), (25, 27, 0, 1),
+    )  # fmt: skip
     assert spans_of([]) == ()

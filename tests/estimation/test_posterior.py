@@ -18,7 +18,7 @@ from tests.estimation.survey import detector, drawn_of_one, place, presumed, sur
 
 AT, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
 WALLS = [((9.5, 4.0, 1.5), (0.05, 4.0, 1.5), "concrete"), ((12.0, 6.2, 1.5), (2.5, 0.05, 1.5), "concrete")]
-SPANS = ((0, 231, 0),)
+SPANS = ((0, 231, 0, 1),)
 CO_60 = jnp.int32(0)
 
 
@@ -72,7 +72,7 @@ def told(boxes, seed):
     site, flight = place(boxes), survey(altitude=12.0, count=231)
     certain = Knowledge(site="exact", background_std=0.05, model_std=0.01)
     known = presumed(site, (detector(),), knowledge=certain, height_std_m=1e-3)
-    problem = problem_of(known, drawn_of_one(site, detector(), flight, AT, ACTIVITY, seed), SPANS, 1)
+    problem = problem_of(known, drawn_of_one(site, detector(), flight, AT, ACTIVITY, seed), SPANS)
     return problem, _state(problem, AT)
 
 
@@ -89,7 +89,7 @@ def _state(problem, at):
         nuclide_value=jnp.zeros((1, 1)),
         towards=fit.towards[None],
     )
-    counts = fit.unknowns.activity_bq * fit.net
+    counts = fit.unknowns.activity_bq * fit.rates.counts
     unknowns = replace(fit.unknowns, activity_bq=jnp.zeros(()))
     added = replace(nothing.added, counts=counts[None])
     return replace(nothing, sources=sources, added=added, unknowns=unknowns, likelihood=fit.likelihood)

@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import chi2, kstest
 
 import swarmsim
-from swarmsim.estimation import Measurements, cramer_rao_covariance, fisher_information
-from swarmsim.estimation.windows import gather, measured, windows_start
-from swarmsim.missions import knowledge
+from swarmsim.estimation import Measurements, cramer_rao_covariance, fisher_information, localise
+from swarmsim.estimation.model import spans_of
+from swarmsim.estimation.windows import gather, measured, merged, windows_start
 from swarmsim.radiation import draw_counts, observed_rois
 from swarmsim.radiation.background import background_factor
 from swarmsim.randomness import mission_keys
@@ -19,15 +19,15 @@ from swarmsim.sensors.radiation import source_rate
 
 pytestmark = pytest.mark.optimised
 
-SEEDS = 256
-# Fewer rounds, rays and places than a mission takes: the bound is asked for within 30 %, and there are 256 fits.
+SEEDS = 32
+# Fewer rounds and places than a mission takes: the bound is asked for within 30 %, and there are many fits.
 QUICK = (
-    "localisation.iterations=120",
-    "localisation.search_rounds=0",
-    "localisation.fisher_steps=4",
-    "localisation.sample_rounds=3",
+    "localisation.screened=48",
+    "localisation.search_rounds=3",
+    "localisation.sample_rounds=4",
     "localisation.samples=32",
-    "localisation.rays_per_window=1",
+    "localisation.sources_max=1",
+    "knowledge={site: exact, pose_std_m: 0.0, sensitivity_std: 0.0, model_std: 0.01, nuclides: [Co-60]}",
 )
 
 
@@ -40,7 +40,7 @@ SURVEY = (
 
 @pytest.fixture(scope="module")
 def survey():
-    """The scenario `recon` with its source in the open, and what 256 missions learn from the counts of its flight."""
+    """The scenario `recon` with its source in the open, and what many missions learn from the counts of its flight."""
     common = ("engine=analytic", "sources.0.position_m=[50.0, -13.0]")
     flown = swarmsim.build(swarmsim.load("recon", common))  # by the programs of tests/missions/test_rollout.py
     batch = flown.rollout(0)
@@ -56,49 +56,53 @@ def survey():
     natural = jax.vmap(jax.vmap(lambda place: background_factor(world.background, world.site, key, place, reference)))
     flat = jax.jit(
         lambda: observed_rois(counter.detector, rate(joined.position_m, joined.axis), natural(joined.position_m))
-    )().sum(axis=-1)
+    )()
     live_s = float(joined.exposure_s.max())
 
     def windows(key):
-        keys = jax.random.split(key, flat.shape)
+        keys = jax.random.split(key, flat.shape[:2])
         each = jax.vmap(jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, live_s)))
         counts, exposure = each(keys, flat)
         drawn = Measurements(
             time_s=joined.time_s, position_m=joined.position_m, travel_m=joined.travel_m, axis=joined.axis,
-            counts=counts, exposure_s=exposure, valid=joined.new, detector=jnp.zeros(counts.shape, jnp.int32),
+            counts=counts.sum(axis=-1), exposure_s=exposure, valid=joined.new, rois=counts,
+            detector=jnp.zeros(counts.shape[:2], jnp.int32),
         )  # fmt: skip
-        return measured(gather(windows_start(3, plan.windows[0], 1), drawn, joined.new, plan.per_window[0]), 0)
+        start = windows_start(3, plan.windows[0], flat.shape[-1])
+        return merged(gather(start, drawn, joined.new, plan.per_window[0]), plan.kept[0])
 
     def mission(key):
-        found = knowledge.survey(plan, windows(key))
-        return found.fit, found.found
+        m = measured(windows(key), 0)
+        found = localise(plan.presumed, m, spans_of([(m.counts.shape[0], 0, 1)]), plan.localisation)
+        return jax.tree.map(lambda x: x[0], found.fits)
 
     keys = mission_keys(np.arange(SEEDS))
-    fits, found = jax.jit(lambda every: jax.lax.map(mission, every))(keys)
-    return simulation, jax.jit(windows)(keys[0]), jax.device_get(fits), np.asarray(found)
+    fits = jax.jit(lambda every: jax.lax.map(mission, every))(keys)
+    return simulation, measured(jax.jit(windows)(keys[0]), 0), jax.device_get(fits)
 
 
 def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
-    simulation, windows, fits, found = survey
+    simulation, windows, fits = survey
     world, plan = simulation.world, simulation.plan
     source = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), world.sources)
     information = jax.jit(lambda: fisher_information(
         world.site, plan.detectors, windows, source.position_m, source.activity_bq, source.nuclide, rays=6,
-        ground_share=plan.localisation.ground_share,
+        ground_share=plan.presumed.ground_share,
     ))()  # fmt: skip
-    bound = np.sqrt(np.diag(cramer_rao_covariance(information, plan.localisation.height_std_m)))[:2]
+    bound = np.sqrt(np.diag(cramer_rao_covariance(information, plan.presumed.height_std_m)))[:2]
     assert np.all((bound > 0.6) & (bound < 1.2))  # tens of centimetres from 20 m above: not a bound that says nothing
     error = fits.position_m[:, :2] - np.asarray(source.position_m)[:2]
     rmse = np.sqrt(np.mean(error**2, axis=0))
     assert np.all(rmse <= 1.3 * bound)
-    assert np.all(rmse >= 0.85 * bound)  # nobody beats the bound: the errors or the bound would be wrong
-    assert np.all(np.abs(error.mean(axis=0)) < 5.0 * bound / np.sqrt(SEEDS))
-    assert np.all(found)
-    assert np.mean(fits.converged) > 0.98
+    # the bound is that of total counts of a known background: energies tell more, an unknown background less
+    assert np.all(rmse >= 0.6 * bound)
+    assert np.all(np.abs(error.mean(axis=0)) < 4.0 * bound / np.sqrt(SEEDS))
+    assert np.all(fits.present)
+    assert np.mean(fits.converged) > 0.95
 
 
 def test_the_aerial_estimate_knows_its_error(survey):
-    simulation, _, fits, _ = survey
+    simulation, _, fits = survey
     world = simulation.world
     error = fits.position_m[:, :2] - np.asarray(world.sources.position_m)[0, :2]
     normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fits.covariance_m2[:, :2, :2]), error)
