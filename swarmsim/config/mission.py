@@ -139,10 +139,10 @@ class Localisation(Model):
     """Estimate of the sources' number, places and activities from the likelihood of the counts.
 
     A source is one where twice the logarithm of the likelihood ratio exceeds the square of ``detection_sigma``. Sources
-    are looked for at points ``grid_m`` apart, then among ``screened`` places around the best of them, then in
-    ``search_rounds`` rounds, the first within ``search_radius_m``, each within two fifths of the one before. The
-    posterior of each is that of ``sample_rounds`` times ``samples`` places. ``rays_per_window`` is for windows of
-    vehicles on the ground, which walls' shadows may cross.
+    are looked for at points ``grid_m`` apart, then within ``search_radius_m`` of the best of them, then in
+    ``search_rounds`` rounds, each within two fifths of the one before. The posterior of each is that of at most
+    ``sample_rounds`` times ``samples`` places. ``rays_per_window`` lead to each window along its way, which walls'
+    shadows may cross.
     """
 
     presumed_height_m: float = Field(ge=-5, le=100)
@@ -153,9 +153,8 @@ class Localisation(Model):
     detection_sigma: float = Field(default=5.5, ge=1, le=100)
     grid_m: float = Field(default=4.0, ge=0.1, le=1000)
     search_radius_m: float = Field(default=6.0, ge=0.01, le=1000)
-    screened: int = Field(default=192, ge=16, le=10_000)
-    search_rounds: int = Field(default=6, ge=1, le=100)
-    sample_rounds: int = Field(default=6, ge=1, le=100)
+    search_rounds: int = Field(default=4, ge=1, le=100)
+    sample_rounds: int = Field(default=12, ge=1, le=100)
     samples: int = Field(default=40, ge=16, le=10_000)
 
 

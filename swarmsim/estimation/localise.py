@@ -5,29 +5,32 @@ posterior of each (`swarmsim.estimation.posterior`).
 """
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
-from swarmsim.estimation.likelihood import natural_background
+from swarmsim.estimation.forward import Problem, Span, nodes_of, padded
+from swarmsim.estimation.likelihood import natural_background, position_covariance
 from swarmsim.estimation.measurements import Measurements, cleared
-from swarmsim.estimation.model import Problem, Span, padded
-from swarmsim.estimation.posterior import posteriors
-from swarmsim.estimation.sources import SearchParams, State, find_sources, no_sources, ratios
+from swarmsim.estimation.posterior import Posterior, posteriors
+from swarmsim.estimation.sources import SearchParams, Sources, State, find_sources, no_sources, ratios
 from swarmsim.pytree import on_host, pytree, static
 from swarmsim.radiation.coarse import coarse
 from swarmsim.radiation.detector import AIR, Detector
-from swarmsim.site import Site, sample, sample_with_gradient
+from swarmsim.site import Site, sample
 from swarmsim.site.model import height_at
 
 LINES = 8  # of a nuclide, to which neighbours are put together
 WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
 BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known: half of it may be missing
 POINTS_MAX = 20_000  # of the grid of the first look
-ENOUGH_EFFECTIVE = 4.0  # weighted places must be worth this many
+ENOUGH_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
+UNSURE = 0.25  # standard deviation of a place whose posterior could not be sampled, over the reach of the search
 
 
 @pytree
@@ -36,7 +39,7 @@ class Presumed:
 
     site: Site  # with the materials that occur in it alone
     detectors: tuple[Detector, ...]  # with few lines for each nuclide
-    material_std: jax.Array  # [M] of ln(true over presumed length); 0: exact
+    material_std: jax.Array  # [U] of ln(true over presumed length) in each uncertain material
     background_std: jax.Array  # [] of a window's ln(background over the level)
     model_std: jax.Array  # [] of a window's ln(true over modelled rate)
     pose_std_m: jax.Array  # [] of measured places
@@ -47,6 +50,7 @@ class Presumed:
     points_m: jax.Array  # [C, 3] where sources are looked for first, world
     height_m: jax.Array  # [] prior of a source's height above ground
     height_std_m: jax.Array  # []
+    uncertain: tuple[int, ...] = static()  # numbers of the U materials whose thickness is not known exactly
 
 
 @pytree
@@ -93,7 +97,7 @@ def localisation_params(spec: Localisation) -> LocalisationParams:
         search=SearchParams(
             threshold=on_host(spec.detection_sigma**2),
             reach_m=on_host(spec.search_radius_m),
-            screened=spec.screened,
+            grid_m=on_host(spec.grid_m),
             rounds=spec.search_rounds,
             sources_max=spec.sources_max,
         ),
@@ -135,14 +139,14 @@ def presume(
     ground = names[int(known.ground_material)]
     # the standard deviation of a uniform distribution over +- share
     std = knowledge.thickness_share / 3.0**0.5 if knowledge.site == "geometry" else 0.0
-    material_std = [0.0 if name in (AIR, ground) else std for name in names]
+    uncertain = tuple(i for i, name in enumerate(names) if std > 0.0 and name not in (AIR, ground))
     nuclides = detectors[0].nuclide_names
     chosen = [knowledge.nuclides == "unknown" or name in knowledge.nuclides for name in nuclides]
     model = knowledge.model_std if knowledge.site in ("exact", "geometry") else max(knowledge.model_std, BLIND_STD)
     return Presumed(
         site=known,
         detectors=tuple(coarse(d, LINES, names) for d in detectors),
-        material_std=on_host(material_std),
+        material_std=on_host([std] * len(uncertain)),
         background_std=on_host(knowledge.background_std),
         model_std=on_host(model),
         pose_std_m=on_host(knowledge.pose_std_m),
@@ -153,6 +157,7 @@ def presume(
         points_m=on_host(_grid(known, corners_m, spec.grid_m, spec.presumed_height_m)),
         height_m=on_host(spec.presumed_height_m),
         height_std_m=on_host(spec.height_std_m),
+        uncertain=uncertain,
     )
 
 
@@ -213,7 +218,9 @@ def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span
         pose_std_m=jnp.sqrt(jnp.square(presumed.pose_std_m) + WAY_SHARE**2 * travel),
         height_m=jnp.asarray(presumed.height_m),
         height_std_m=jnp.asarray(presumed.height_std_m),
+        nodes=tuple(nodes_of(presumed.site, m, span) for span in spans),
         spans=spans,
+        uncertain=presumed.uncertain,
     )
 
 
@@ -247,39 +254,58 @@ def localise(
     return _report(presumed, problem, params, state)
 
 
+def _sampled(
+    presumed: Presumed, params: LocalisationParams, s: Sources, posterior: Posterior
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Whether each posterior [K] was sampled well enough; their means [K, 4] and covariances [K, 4, 4].
+
+    One that could not be computed says nothing: then they are the best place, and the reach of the search as its error.
+    """
+    known = jnp.concatenate([s.place, jnp.log(jnp.maximum(s.activity_bq, 1.0))[:, None]], axis=1)
+    reach, height = params.search.reach_m, jnp.maximum(presumed.height_std_m, 1e-3)
+    wide = jnp.diag(jnp.square(jnp.stack([reach, reach, height, jnp.ones(())])))
+    sound = jnp.isfinite(posterior.mean).all(axis=1) & jnp.isfinite(posterior.covariance).all(axis=(1, 2))
+    mean = jnp.where(sound[:, None], posterior.mean, known)
+    covariance = jnp.where(sound[:, None, None], posterior.covariance, wide)
+    converged = sound & (posterior.effective >= ENOUGH_EFFECTIVE) & (posterior.halves <= HALVES_AGREE)
+    # too few places to tell their spread: it must not look small
+    unsure = jnp.where(converged, 0.0, jnp.square(UNSURE * reach))
+    return converged, mean, covariance + unsure[:, None, None] * jnp.diag(jnp.array([1.0, 1.0, 0.0, 0.0]))
+
+
 def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Estimated:
     site, s, m = presumed.site, state.sources, problem.measurements
     posterior, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
-    mean, covariance = posterior.mean, posterior.covariance
+    converged, mean, covariance = _sampled(presumed, params, s, posterior)
     log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std)
     height = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(mean[:, :2])
     activity = jnp.exp(mean[:, 3])
 
-    def in_space(at: jax.Array, c: jax.Array) -> jax.Array:
-        _, slope = sample_with_gradient(site.terrain_m, site, at[:2])
-        turn = jnp.eye(3).at[2, :2].set(slope)
-        return turn @ c[:3, :3] @ turn.T
-
+    in_space = jax.vmap(partial(position_covariance, site))(mean, covariance)
     share = jax.nn.softmax(s.nuclide_value, axis=1)
     fits = SourceFits(
         present=s.present,
         position_m=mean[:, :3].at[:, 2].add(height),
-        covariance_m2=jax.vmap(in_space)(mean, covariance) + jnp.square(presumed.place_std_m) * jnp.eye(3),
+        covariance_m2=in_space + jnp.square(presumed.place_std_m) * jnp.eye(3),
         activity_bq=activity,
         activity_std_bq=activity * jnp.sqrt(log_variance),
         nuclide=s.nuclide,
         nuclide_confidence=jnp.take_along_axis(share, s.nuclide[:, None], axis=1)[:, 0],
         detection=detection,
-        effective_samples=posterior.effective,
-        converged=(posterior.effective >= ENOUGH_EFFECTIVE) & (posterior.halves <= HALVES_AGREE),
+        effective_samples=jnp.nan_to_num(posterior.effective),
+        converged=converged,
     )
     order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))
+
+    def ordered(x: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf[order], x)
+
     return Estimated(
-        fits=jax.tree.map(lambda x: x[order], fits),
+        fits=ordered(fits),
         background_scale=jnp.exp(state.unknowns.level[0]),
         misfit=(overall.chi_squared - overall.freedom) / overall.spread,
         chi_squared=overall.chi_squared / overall.freedom,
         windows=jnp.sum(m.valid),
-        state=replace(state, sources=jax.tree.map(lambda x: x[order], s)),
+        state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -4,10 +4,12 @@ Where walls throw shadows the likelihood has steps and ridges of its own height 
 open. The largest of them is a matter of chance: the maximum is neither the estimate of least squared error nor stable
 under rounding, and its curvature says nothing about the uncertainty. The mean over the region has none of these faults.
 
-Places are drawn in rounds, each from a normal distribution with the moments that the earlier ones gave, and weighted
-with the posterior over the mixture of all distributions drawn from (adaptive multiple importance sampling: Cornuet,
-Marin, Mira and Robert, Scandinavian Journal of Statistics 39, 2012, 798). Whatever else is unknown is fitted at each
-place; its own spread about that is normal.
+Places are drawn in rounds. Those of a round lie about places that the earlier ones found likely, at several distances
+(population Monte Carlo: Cappé, Guillin, Marin and Robert, Journal of Computational and Graphical Statistics 13, 2004,
+907), and are weighted with the posterior over the mixture of all distributions drawn from (adaptive multiple importance
+sampling: Cornuet, Marin, Mira and Robert, Scandinavian Journal of Statistics 39, 2012, 798). Rounds go on until the
+places are worth enough independent ones. Whatever else is unknown is fitted at each place; its own spread about that is
+normal.
 """
 
 from collections.abc import Callable
@@ -16,20 +18,23 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim.device import each
+from swarmsim.estimation.fit import MEAN_FLOOR, alone, normal_equations, settle
+from swarmsim.estimation.forward import Problem, ways_from
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
-from swarmsim.estimation.model import MEAN_FLOOR, Problem, _normal
-from swarmsim.estimation.search import attempt, bounds
-from swarmsim.estimation.sources import ALONE_STEPS, State, _alone, without
+from swarmsim.estimation.search import TOGETHER, bounds
+from swarmsim.estimation.sources import ALONE_STEPS, State, without
 from swarmsim.pytree import pytree
 
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
 # "The unreasonable effectiveness of quasirandom sequences", 2018).
 _EVEN = (0.8191725, 0.6710436, 0.5497005)
 FIRST_SPREAD = 2.0  # standard deviations of the first round over those that the curvature promises
-SPREAD = 1.25  # the same of later rounds over those of the places weighed so far
-WIDE_EVERY = 4  # one place in so many comes from a distribution `WIDE` times as wide: no tail goes unseen
-WIDE = 2.5
+SCALES = (2.5, 1.2, 1.2, 0.6)  # spread of a round's places, in turn, over that of the places weighed so far
+ABOUT_MEAN = 3  # so many of the scales are about the mean: no tail goes unseen. The others are about likely places.
 LEAST_EFFECTIVE = 16.0  # weights are flattened until they count as this many when the next round is placed
+ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
+LEAST_ROUNDS = 4
 LEAST_STD_M = 1e-3
 WEIGH_STEPS = 1  # Gauss-Newton steps at a place
 
@@ -63,16 +68,26 @@ class Posterior:
     halves: jax.Array  # [] distance between the means of two halves of the places, in standard deviations
 
 
+@pytree
+class _Rounds:
+    """Places weighed so far, and the distributions that they were drawn from; Q rounds of P places."""
+
+    known: Weighed  # [Q, P]
+    centres: jax.Array  # [Q, P, 3]
+    roots: jax.Array  # [Q, 3, 3] of the covariance
+    count: jax.Array  # [] int32 rounds done
+
+
 def sample_posterior(
     weigh: Callable[[jax.Array], Weighed], start: jax.Array, covariance: jax.Array, rounds: int, per_round: int
 ) -> Posterior:
     """Moments of the posterior around ``start`` [3], whose covariance near it is about ``covariance`` [3, 3].
 
-    ``weigh`` gives the posterior at a place [3].
+    ``weigh`` gives the posterior at a place [3]. There are ``rounds`` of ``per_round`` places at most.
     """
     even = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(_EVEN), 1.0)
     normal = jax.scipy.special.ndtri(jnp.clip(even, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
-    normal = normal * jnp.where(jnp.arange(per_round) % WIDE_EVERY == 0, WIDE, 1.0)[:, None]
+    scales = _scales(per_round)
 
     # The places of rounds to come have no weight yet, and their distributions no density.
     none = jnp.zeros((rounds, per_round))
@@ -82,37 +97,71 @@ def sample_posterior(
         variance=none,
         log_posterior=jnp.full((rounds, per_round), -jnp.inf),
     )
-    means, roots = jnp.zeros((rounds, 3)), jnp.broadcast_to(jnp.eye(3), (rounds, 3, 3))
-    Carry = tuple[Weighed, jax.Array, jax.Array, jax.Array, jax.Array]
+    nowhere = _Rounds(
+        known=empty,
+        centres=jnp.zeros((rounds, per_round, 3)),
+        roots=jnp.broadcast_to(jnp.eye(3), (rounds, 3, 3)),
+        count=jnp.int32(0),
+    )
 
-    def round_(carry: Carry, inputs: tuple[jax.Array, jax.Array]) -> tuple[Carry, None]:
-        known, means, roots, mean, covariance = carry
-        k, normal = inputs
-        root = jnp.linalg.cholesky(covariance)
-        means, roots = means.at[k].set(mean), roots.at[k].set(root)
-        drawn = jax.lax.map(weigh, mean + normal @ root.T)
-        known = jax.tree.map(lambda all_, new: all_.at[k].set(new), known, drawn)
-        weight = _flattened(_log_weights(known, means, roots, k), LEAST_EFFECTIVE)
-        mean, covariance = _moments(known.place, weight)
-        return (known, means, roots, mean, SPREAD**2 * covariance + LEAST_STD_M**2 * jnp.eye(3)), None
+    def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
+        """Centres and the covariance of the next round."""
+        weight = _flattened(_log_weights(done), LEAST_EFFECTIVE)
+        mean, about = _moments(done.known.place, weight)
+        likely = _drawn_evenly(done.known.place.reshape(-1, 3), weight.reshape(-1), per_round)
+        wide = jnp.arange(per_round)[:, None] % len(SCALES) < ABOUT_MEAN
+        first = done.count == 0
+        centres = jnp.where(first, start, jnp.where(wide, mean, likely))
+        return centres, jnp.where(first, (FIRST_SPREAD / SCALES[1]) ** 2 * covariance, about)
 
-    first = FIRST_SPREAD**2 * covariance + LEAST_STD_M**2 * jnp.eye(3)
-    carry: Carry = (empty, means, roots, start, first)
-    known, means, roots, _, _ = jax.lax.scan(round_, carry, (jnp.arange(rounds), normal))[0]
-    log_weights = _log_weights(known, means, roots, jnp.asarray(rounds - 1))
+    def round_(done: _Rounds) -> _Rounds:
+        k = done.count
+        centres, about = placed(done)
+        root = jnp.linalg.cholesky(about + LEAST_STD_M**2 * jnp.eye(3))
+        drawn = each(weigh, centres + scales[:, None] * (normal[k] @ root.T), TOGETHER)
+        known = jax.tree.map(lambda all_, new: all_.at[k].set(new), done.known, drawn)
+        return _Rounds(
+            known=known, centres=done.centres.at[k].set(centres), roots=done.roots.at[k].set(root), count=k + 1
+        )  # fmt: skip
+
+    def more(done: _Rounds) -> jax.Array:
+        enough = _effective(_truncated(_log_weights(done))) >= ENOUGH_EFFECTIVE
+        return (done.count < rounds) & ~(enough & (done.count >= LEAST_ROUNDS))
+
+    done = jax.lax.while_loop(more, round_, nowhere)
+    return _summary(done)
+
+
+def _summary(done: _Rounds) -> Posterior:
+    known, log_weights = done.known, _log_weights(done)
     weight = _flattened(log_weights, LEAST_EFFECTIVE)
-    effective = _effective(_truncated(log_weights))
     values = jnp.concatenate([known.place, known.log_activity[..., None]], axis=-1)
     mean, covariance = _moments(values, weight)
     covariance = covariance.at[3, 3].add(jnp.sum(weight * known.variance))
     return Posterior(
-        mean=mean, covariance=covariance, effective=effective, halves=_halves(values, log_weights, covariance)
+        mean=mean,
+        covariance=covariance,
+        effective=_effective(_truncated(log_weights)),
+        halves=_halves(values, log_weights, covariance),
     )
 
 
+def _scales(per_round: int) -> jax.Array:
+    return jnp.array(SCALES)[jnp.arange(per_round) % len(SCALES)]
+
+
+def _drawn_evenly(places: jax.Array, weight: jax.Array, count: int) -> jax.Array:
+    """``count`` of the places [N, 3], each as often as its weight [N] says (systematic resampling, Kitagawa 1996)."""
+    at = (jnp.arange(count) + 0.5) / count
+    index = jnp.searchsorted(jnp.cumsum(weight), at)
+    # neighbours in the order of the places have different scales
+    turned = jnp.argsort(jnp.mod(jnp.arange(count) * _EVEN[0], 1.0))
+    return places[jnp.minimum(index, places.shape[0] - 1)][turned]
+
+
 def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array) -> jax.Array:
-    """How far the means of the even and the odd places of each round lie apart, in standard deviations of x and y."""
-    odd = jnp.arange(values.shape[1]) // WIDE_EVERY % 2 == 1  # both halves have their share of wide ones
+    """How far the means of two halves of the places of each round lie apart, in standard deviations of x and y."""
+    odd = jnp.arange(values.shape[1]) // len(SCALES) % 2 == 1  # both halves have all scales
     means = [
         _moments(values, _truncated(jnp.where(half, log_weights, -jnp.inf)))[0] for half in (odd, jnp.logical_not(odd))
     ]
@@ -120,17 +169,23 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array) ->
     return jnp.max(apart)
 
 
-def _log_weights(known: Weighed, means: jax.Array, roots: jax.Array, last: jax.Array) -> jax.Array:
-    """Logarithms [K, n] of posterior over mixture of the distributions of the rounds up to ``last``."""
-    offset = known.place[..., None, :] - means  # [K, n, K, 3]
-    scaled = jnp.einsum("qij,knqj->knqi", _inverse(roots), offset)
-    scale = jnp.sum(jnp.log(jnp.diagonal(roots, axis1=-2, axis2=-1)), axis=-1)
-    squared = jnp.sum(scaled**2, axis=-1)
-    share = 1.0 / WIDE_EVERY
-    narrow, wide = jnp.log(1.0 - share) - 0.5 * squared, jnp.log(share / WIDE**3) - 0.5 * squared / WIDE**2
-    log_density = jnp.logaddexp(narrow, wide) - scale
-    log_density = jnp.where(jnp.arange(means.shape[0]) <= last, log_density, -jnp.inf)
-    mixture = jax.scipy.special.logsumexp(log_density, axis=-1)
+def _log_weights(done: _Rounds) -> jax.Array:
+    """Logarithms [Q, P] of posterior over mixture of the distributions of all rounds so far."""
+    known, scales = done.known, _scales(done.centres.shape[1])
+    inverse = _inverse(done.roots)
+
+    def of_round(k: jax.Array) -> jax.Array:
+        """Log density [Q P] of round ``k``."""
+        # relative to one of them: large coordinates would lose digits in float32
+        origin = done.centres[0, 0]
+        turned = (known.place.reshape(-1, 3) - origin) @ inverse[k].T
+        offset = (turned[:, None] - (done.centres[k] - origin) @ inverse[k].T) / scales[:, None]
+        each_ = -0.5 * jnp.sum(offset * offset, axis=-1) - 3.0 * jnp.log(scales)
+        log_scale = jnp.sum(jnp.log(jnp.diagonal(done.roots[k])))
+        return jnp.where(k < done.count, jax.scipy.special.logsumexp(each_, axis=-1) - log_scale, -jnp.inf)
+
+    density = jax.lax.map(of_round, jnp.arange(done.roots.shape[0]))
+    mixture = jax.scipy.special.logsumexp(density, axis=0).reshape(known.log_posterior.shape)
     return jnp.where(jnp.isfinite(known.log_posterior), known.log_posterior - mixture, -jnp.inf)
 
 
@@ -208,7 +263,7 @@ def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_ro
     u, nuclide = replace(state.unknowns, activity_bq=s.activity_bq[k]), s.nuclide[k]
 
     def weigh(place: jax.Array) -> Weighed:
-        fit = attempt(problem, nuclide, others, u, place, WEIGH_STEPS, False).fit
+        fit = settle(problem, ways_from(problem, place), nuclide, others, u, WEIGH_STEPS, exact=False)
         inside = jnp.all((place >= limits[0]) & (place <= limits[1]))
         return Weighed(
             place=place,
@@ -227,8 +282,8 @@ def goodness(problem: Problem, state: State) -> Goodness:
     """How well the sources of ``state`` describe the counts."""
     m = problem.measurements
     assert m.rois is not None
-    u, model = _alone(problem, state.added, state.unknowns, ALONE_STEPS)
-    at = _normal(problem, model, u)
+    u, model = alone(problem, state.added, state.unknowns, ALONE_STEPS)
+    at = normal_equations(problem, model, u)
     mean = jnp.maximum(model.mean, MEAN_FLOOR)
     cells = m.valid[:, None] & (problem.background > 0.0)
     return Goodness(

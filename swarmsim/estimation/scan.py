@@ -9,7 +9,8 @@ up to the direction to the crystal, so that both are matrix products: (points x 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.model import Others, Problem, Unknowns, _linear, _normal, detector_of, padded, silent
+from swarmsim.estimation.fit import Others, Unknowns, linearised, normal_equations
+from swarmsim.estimation.forward import Problem, detector_of, padded, silent
 from swarmsim.pytree import pytree
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import roi_rates_and_slopes
@@ -54,8 +55,8 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     """
     m, regions = problem.measurements, problem.background.shape[1]
     assert m.rois is not None
-    model = _linear(problem, silent(problem), others, jnp.zeros(3), u)
-    at = _normal(problem, model, u)
+    model = linearised(problem, silent(problem), others, jnp.zeros(3), u)
+    at = normal_equations(problem, model, u)
     weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, 1e-3), 0.0)
     names, models = problem.detectors[0].material_names, detector_of(problem)
     air = names.index("air") if "air" in names else 0

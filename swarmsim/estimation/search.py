@@ -10,27 +10,26 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.likelihood import height_precision
-from swarmsim.estimation.model import (
+from swarmsim.device import each
+from swarmsim.estimation.fit import (
     MEAN_FLOOR,
     Others,
-    Problem,
     Settled,
     Unknowns,
-    _linear,
-    _normal,
-    position_of,
-    rates,
+    linearised,
+    normal_equations,
     settle,
-    ways_from,
 )
+from swarmsim.estimation.forward import Problem, Rates, rates, ways_from, with_one_ray
+from swarmsim.estimation.likelihood import height_precision
 from swarmsim.pytree import pytree
 
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
 GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
-SETTLED = 3  # of the places screened in a round, which are fitted
+FITTED = 4  # of the candidates of a round: the best of each part
 STEPS = 3  # Gauss-Newton steps at a place
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
+TOGETHER = 16  # places that an accelerator looks at side by side
 
 Bounds = tuple[jax.Array, jax.Array]  # lower and upper [3]
 
@@ -39,24 +38,28 @@ Bounds = tuple[jax.Array, jax.Array]  # lower and upper [3]
 class Tried:
     """Places and the fits there; leading axis."""
 
-    place: jax.Array  # [..., 3]
+    place: jax.Array  # [..., 3] x, y, height above the ground
+    nuclide: jax.Array  # [...] int32
     fit: Settled
 
 
-def attempt(
-    problem: Problem,
-    nuclide: jax.Array,
-    others: Others,
-    u: Unknowns,
-    place: jax.Array,
-    steps: int,
-    fresh: jax.Array | bool,
-) -> Tried:
-    """The fit at a place [3]."""
+@pytree
+class Candidates:
+    """Places that may be better; C of them in `FITTED` parts of equal size."""
+
+    place: jax.Array  # [C, 3]
+    nuclide: jax.Array  # [C] int32
+    counts: jax.Array  # [C] bool, whether it is one
+    sure: jax.Array  # [C] bool, to be fitted in any case; one of its part at most
+    apart: jax.Array  # [] bool, whether the best of each part is fitted, or the best of all
+
+
+def attempt(problem: Problem, nuclide: jax.Array, others: Others, u: Unknowns, place: jax.Array) -> Tried:
+    """The fit at a place [3] from the unknowns ``u``, of which the activity is not used."""
     # lengths that a wrong place asked for would make others look wrong
     u = replace(u, lengths=jnp.zeros_like(u.lengths))
-    ways = ways_from(problem, place)
-    return Tried(place=place, fit=settle(problem, ways, nuclide, others, u, steps, fresh))
+    fit = settle(problem, ways_from(problem, place), nuclide, others, u, STEPS, fresh=True)
+    return Tried(place=place, nuclide=nuclide, fit=fit)
 
 
 @pytree
@@ -67,34 +70,29 @@ class Screen:
     weight: jax.Array  # [n, R] over their variance
     own: jax.Array  # [n, R, 2] change with the window's own unknowns
     inverse: jax.Array  # [n, 2, 2] of the information about those
-    share: jax.Array  # [n] of the counts that is registered
+    registered: jax.Array  # [n] of the counts that are added
 
 
-def screen_of(problem: Problem, others: Others, at: Tried) -> Screen:
-    """The screen from the fit ``at`` a place."""
-    m, fit = problem.measurements, at.fit
-    u, net = fit.unknowns, fit.rates.counts
+def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array, u: Unknowns) -> Screen:
+    """The screen from the fit ``u`` with a source at ``where`` [3] (world) that adds ``source``."""
+    m = problem.measurements
     assert m.rois is not None
-    where = position_of(problem.site, at.place)
-    model = _linear(problem, fit.rates, others, where, u)
-    linear = _normal(problem, model, u)
+    model = linearised(problem, source, others, where, u)
     zero = jnp.zeros_like(u.gain)
-    bare = replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(()))
-    rest = _linear(problem, fit.rates, others, where, bare)
-    true = jnp.sum(u.activity_bq * net * jnp.exp(u.gain)[:, None], axis=1)
-    added = jnp.sum(model.common[..., 0], axis=1)
+    rest = linearised(problem, source, others, where, replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(())))
     return Screen(
         left=jnp.where(m.valid[:, None], m.rois - rest.mean, 0.0),
         weight=jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, MEAN_FLOOR), 0.0),
         own=model.own,
-        inverse=linear.own,
-        share=jnp.where(true > 0.0, added / jnp.maximum(true, 1e-20), 1.0),
+        inverse=normal_equations(problem, model, u).own,
+        registered=model.registered,
     )
 
 
-def screened(problem: Problem, screen: Screen, nuclide: jax.Array, lengths: jax.Array, place: jax.Array) -> jax.Array:
+def screened(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> jax.Array:
     """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted."""
-    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts * screen.share[:, None]
+    lengths = jnp.zeros_like(problem.material_std)
+    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts * screen.registered[:, None]
     weighted = screen.weight * net
     inside = jnp.stack([jnp.sum(screen.own[..., k] * weighted, axis=1) for k in range(2)], axis=-1)
     of_left = jnp.stack([jnp.sum(screen.own[..., k] * screen.weight * screen.left, axis=1) for k in range(2)], axis=-1)
@@ -103,67 +101,46 @@ def screened(problem: Problem, screen: Screen, nuclide: jax.Array, lengths: jax.
     information = jnp.sum(weighted * net) - jnp.sum(back * inside)
     deviation = place[2] - problem.height_m
     prior = 0.5 * height_precision(problem.height_std_m) * jnp.square(deviation)
-    return 0.5 * jnp.square(jnp.maximum(score, 0.0)) / jnp.maximum(information, 1e-30) - prior
+    value = 0.5 * jnp.square(jnp.maximum(score, 0.0)) / jnp.maximum(information, 1e-30) - prior
+    return jnp.where(jnp.isfinite(value), value, -jnp.inf)
 
 
-@pytree
-class Asked:
-    """Places to be fitted; the first ``count`` of m."""
+def spread(centre: jax.Array, reach_m: jax.Array, up_m: jax.Array, count: int, turn: jax.Array) -> jax.Array:
+    """Places [count, 3] within ``reach_m`` of ``centre`` [3], denser near it, heights within ``up_m``.
 
-    place: jax.Array  # [m, 3]
-    nuclide: jax.Array  # [m] int32
-    fresh: jax.Array  # [m] bool, whether the activity is not known yet
-    count: jax.Array  # [] int32
-
-
-def promising(
-    problem: Problem,
-    nuclide: jax.Array,
-    others: Others,
-    best: Tried,
-    reach_m: jax.Array,
-    number: jax.Array,
-    count: int,
-    most: int,
-) -> Asked:
-    """The best of ``count`` places within ``reach_m`` of the best so far, by a screen.
-
-    A third of them is up to three times as far. ``number`` [] turns the pattern; ``most`` is the size of the result.
+    A third of them is up to three times as far; ``turn`` [] turns the pattern.
     """
-    low, high = bounds(problem)
     index = jnp.arange(count)
     share = jnp.sqrt((index + 0.5) / count) * jnp.where(index % 3 == 2, 3.0, 1.0)
-    turn = GOLDEN_ANGLE_RAD * (index + count * number)
-    height = 2.0 * jnp.mod((index + count * number) * GOLDEN_RATIO, 1.0) - 1.0
-    up = height * jnp.minimum(reach_m, 1.5 * problem.height_std_m)
-    offset = jnp.stack([reach_m * share * jnp.cos(turn), reach_m * share * jnp.sin(turn), up], axis=-1)
-    places = jnp.clip(best.place + offset, low, high)
-    screen, lengths = screen_of(problem, others, best), jnp.zeros_like(best.fit.unknowns.lengths)
-    values = jax.lax.map(lambda p: screened(problem, screen, nuclide, lengths, p), places)
-    chosen = places[jax.lax.top_k(values, SETTLED)[1]]
-    return Asked(
-        place=jnp.pad(chosen, [(0, most - SETTLED), (0, 0)]),
-        nuclide=jnp.full(most, nuclide),
-        fresh=jnp.zeros(most, bool),
-        count=jnp.int32(SETTLED),
-    )
+    angle = GOLDEN_ANGLE_RAD * (index + count * turn)
+    height = 2.0 * jnp.mod((index + count * turn) * GOLDEN_RATIO, 1.0) - 1.0
+    offset = jnp.stack([reach_m * share * jnp.cos(angle), reach_m * share * jnp.sin(angle), up_m * height], axis=-1)
+    return centre + offset
 
 
-def answered(
-    problem: Problem, others: Others, u: Unknowns, asked: Asked, best: Tried, steps: int
-) -> tuple[Tried, jax.Array, jax.Array]:
-    """The best of the places asked for and ``best``, its number (-1: that of ``best``), and the value of each [m]."""
-    Carry = tuple[jax.Array, Tried, jax.Array, jax.Array]
+def best_of(
+    problem: Problem, others: Others, u: Unknowns, screen: Screen, candidates: Candidates, best: Tried
+) -> tuple[Tried, jax.Array]:
+    """The best of ``candidates`` and of ``best``, and the value of each candidate [C].
 
-    def next_(carry: Carry) -> Carry:
-        k, best, number, values = carry
-        tried = attempt(problem, asked.nuclide[k], others, u, asked.place[k], steps, asked.fresh[k])
-        better = tried.fit.value > best.fit.value
-        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), tried, best)
-        return k + 1, best, jnp.where(better, k, number), values.at[k].set(tried.fit.value)
-
-    start: Carry = (jnp.int32(0), best, jnp.int32(-1), jnp.full(asked.nuclide.shape, -jnp.inf))
-    return jax.lax.while_loop(lambda c: c[0] < asked.count, next_, start)[1:]
+    The most promising ones are fitted from the unknowns ``u``; the values of the rest are those of the screen.
+    """
+    low, high = bounds(problem)
+    places, c = jnp.clip(candidates.place, low, high), candidates
+    quick = with_one_ray(problem)
+    seen = each(lambda x: screened(quick, screen, x[1], x[0]), (places, c.nuclide), TOGETHER)
+    rank = jnp.where(c.sure, jnp.inf, jnp.where(c.counts, seen, -jnp.inf))
+    parts = rank.reshape(FITTED, -1)
+    of_parts = jnp.argmax(parts, axis=1) + jnp.arange(FITTED) * parts.shape[1]
+    chosen = jnp.where(c.apart, of_parts, jax.lax.top_k(rank, FITTED)[1])
+    tried = each(
+        lambda k: attempt(problem, c.nuclide[k], others, u, places[k]), chosen, FITTED
+    )  # fmt: skip
+    value = jnp.where(rank[chosen] > -jnp.inf, tried.fit.value, -jnp.inf)
+    first = jnp.argmax(value)
+    values = jnp.where(c.counts, seen + (value - seen[chosen])[first], -jnp.inf).at[chosen].set(value)
+    better = value[first] > best.fit.value
+    return jax.tree.map(lambda a, b: jnp.where(better, a[first], b), tried, best), values
 
 
 def bounds(problem: Problem) -> Bounds:

@@ -7,38 +7,26 @@ that are allowed, and the sources known before are fitted again beside it.
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.model import (
-    Others,
-    Problem,
-    Settled,
-    Unknowns,
-    _linear,
-    _log_likelihood,
-    _moved,
-    _normal,
-    _prior,
-    nothing_known,
-    position_of,
-    rates,
-    silent,
-    variance_of,
-    ways_from,
-)
+from swarmsim.estimation.fit import Others, Settled, Unknowns, nothing_known, without_more
+from swarmsim.estimation.forward import Problem, Rates, rates, variance_of, ways_from
+from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.scan import scan, strongest
-from swarmsim.estimation.search import STEPS, Asked, Tried, answered, promising
+from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread
 from swarmsim.pytree import pytree, static
 
 ALONE_STEPS = 4  # Gauss-Newton steps without a further source
-SCREENED = 48  # places looked at in a later round of the search
-STARTS = 6  # grid points that are tried for a further source
-FAR = 1.5  # reach of the first round, in which the most are looked at
-CLOSING = 0.4  # reach of a round over that of the one before
+PART = 12  # candidates in each part of a round, at least
+STARTS = 8  # grid points that are tried for a further source
+BEGINNINGS = STARTS // FITTED  # rounds that try them
+AROUND = 1.5  # how far around a grid point, over the distance from one to the next
+REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; nuclides are compared in the second
+CLOSING = 0.4  # reach of a later round over that of the one before
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
+HOPELESS = 0.4  # of the threshold: the ratio at the best of the starts below which no further round is worth while
 APART_M = 12.0  # between starts
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
@@ -49,9 +37,9 @@ class SearchParams:
     """Settings of the search for sources."""
 
     threshold: jax.Array  # [] twice the logarithm of the likelihood ratio that a source must reach
-    reach_m: jax.Array  # [] of the first round around a grid point
-    screened: int = static()  # places looked at in the first round around a grid point
-    rounds: int = static()
+    reach_m: jax.Array  # [] of the search around the best of the grid points
+    grid_m: jax.Array  # [] from one grid point to the next
+    rounds: int = static()  # that close in
     sources_max: int = static()
 
 
@@ -65,6 +53,14 @@ class Sources:
     present: jax.Array  # [K] bool
     nuclide_value: jax.Array  # [K, N] logarithm of the posterior of each nuclide at its place
     towards: jax.Array  # [K, 3, 3] information about its place (`Settled.towards`)
+
+
+@pytree
+class Starts:
+    """Grid points that are tried for a further source."""
+
+    point_m: jax.Array  # [S, 3] world
+    nuclide: jax.Array  # [S] int32 that explains most there
 
 
 @pytree
@@ -114,39 +110,13 @@ def signals(problem: Problem, s: Sources, lengths: jax.Array) -> Others:
     return jax.lax.map(one, (s.place, s.nuclide, s.activity_bq, s.present))
 
 
-def _alone(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, Any]:
-    """Best unknowns with the sources ``others`` alone, and the model there."""
-    m = problem.measurements
-    assert m.rois is not None
-
-    def linear(u: Unknowns) -> Any:
-        return _linear(problem, silent(problem), others, jnp.zeros(3), u)
-
-    def step(u: Unknowns, _: None) -> tuple[Unknowns, None]:
-        return _moved(problem, u, _normal(problem, linear(u), u)), None
-
-    u = jax.lax.scan(step, replace(u, activity_bq=jnp.zeros(())), None, length=steps)[0]
-    return u, linear(u)
-
-
-def without_more(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, jax.Array]:
-    """Best unknowns with the sources ``others`` alone, and the likelihood with the priors."""
-    m = problem.measurements
-    assert m.rois is not None
-    u, model = _alone(problem, others, u, steps)
-    common = _prior(problem, u.others.shape[0])
-    penalty = jnp.sum(common[-u.lengths.shape[0] :] * jnp.square(u.lengths))
-    each = jnp.stack([u.background, u.gain], axis=-1)
-    penalty = penalty + jnp.sum(jnp.where(m.valid[:, None], model.precision * jnp.square(each), 0.0))
-    return u, _log_likelihood(m.rois, model.mean, m.valid) - 0.5 * penalty
-
-
 @pytree
 class _Progress:
     """How far the search is."""
 
     state: State
     again: jax.Array  # [K] bool, sources that are to be sought again, the others held
+    wide: jax.Array  # [] bool, whether they are sought as far as a new one
     trial: jax.Array  # [] bool, whether ``state`` lacks a source that `before` has
     before: State
     over: jax.Array  # [] bool
@@ -171,36 +141,43 @@ def find_sources(
     first = settled(problem, replace(state, added=signals(problem, state.sources, state.unknowns.lengths)))
     no = jnp.array(False)
     start = _Progress(
-        state=first, again=first.sources.present, trial=no, before=first, over=no,
+        state=first, again=first.sources.present, wide=~no, trial=no, before=first, over=no,
         left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max),
     )  # fmt: skip
 
     def step(p: _Progress) -> _Progress:
         adding = ~jnp.any(p.again)
         slot = jnp.where(adding, jnp.argmin(p.state.sources.present), jnp.argmax(p.again))
-        state, found = _sought(problem, points_m, allowed, params, p.state, slot, adding)
+        state, found = _sought(problem, points_m, allowed, params, p.state, slot, adding, p.wide)
         present = state.sources.present
         mine = jnp.arange(present.shape[0]) == slot
         again = jnp.where(adding & found, present, p.again) & ~mine
         done = ~jnp.any(again) & (found | ~adding)
-        p = replace(p, state=state, again=again, over=adding & ~found, left=p.left - 1)
+        wide = p.wide & jnp.any(again) & ~adding
+        p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
+        untried = done & ~p.trial & (jnp.sum(present) >= 2)
         p = _ended_trial(params, p, done & p.trial)
-        p = _begun_trial(problem, params, p, done & ~p.trial & (jnp.sum(present) >= 2))
+        p = _begun_trial(problem, params, p, untried)
         full = jnp.all(p.state.sources.present) & ~jnp.any(p.again)
         return replace(p, over=p.over | full | (p.left <= 0))
 
-    return jax.lax.while_loop(lambda p: ~p.over, step, start).state
+    end = jax.lax.while_loop(lambda p: ~p.over, step, start)
+    # a trial that found no end has shown nothing
+    return jax.tree.map(partial(jnp.where, end.trial), end.before, end.state)
 
 
 def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.Array) -> _Progress:
-    """``now``, and if a source may be missed little: the others without it, to be sought again."""
+    """``now``: the others without the source that is missed least, to be sought again.
+
+    For a trial if that source may not be needed; for good if the counts do not ask for it where the others are.
+    """
 
     def begin() -> _Progress:
         s = p.state.sources
         ratio = jnp.where(s.present, ratios(problem, p.state), jnp.inf)
         k = jnp.argmin(ratio)
         less = replace(p, state=settled(problem, without(p.state, k)), before=p.state)
-        less = replace(less, trial=jnp.array(True), again=less.state.sources.present)
+        less = replace(less, trial=ratio[k] >= params.threshold, again=less.state.sources.present)
         return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * params.threshold), less, p)
 
     return jax.lax.cond(now, begin, lambda: p)
@@ -221,130 +198,132 @@ def _sought(
     state: State,
     slot: jax.Array,
     adding: jax.Array,
+    wide: jax.Array,
 ) -> tuple[State, jax.Array]:
     """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one."""
     s = state.sources
     others = without(state, slot).added
-    own = jnp.arange(allowed.shape[0]) == s.nuclide[slot]
-    nuclides = jnp.where(adding, allowed, own)
-    scanned = scan(problem, points_m, nuclides, others, state.unknowns)
-    index, statistic = strongest(scanned, points_m, STARTS, APART_M)
+
+    def first_look() -> tuple[Starts, jax.Array]:
+        scanned = scan(problem, points_m, allowed, others, state.unknowns)
+        index, statistic = strongest(scanned, points_m, STARTS, APART_M)
+        return Starts(point_m=points_m[index], nuclide=scanned.nuclide[index]), statistic[0]
+
+    nothing = Starts(point_m=jnp.zeros((STARTS, 3)), nuclide=jnp.zeros(STARTS, jnp.int32))
+    starts, statistic = jax.lax.cond(adding, first_look, lambda: (nothing, jnp.zeros(())))
 
     def look() -> tuple[State, jax.Array]:
-        best, nuclide, values = _best(
-            problem, points_m[index], scanned.nuclide[index], nuclides, params, state, others, slot, adding
-        )
+        best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
         found = ~adding | (ratio > params.threshold)
-        after = _with(problem, state, slot, best, nuclide)
-        kept = jnp.where(adding, values, s.nuclide_value[slot])
+        after = _with(problem, state, slot, best)
+        kept = jnp.where(adding | wide, values, s.nuclide_value[slot])
         table = after.sources.nuclide_value.at[slot].set(kept)
         after = replace(after, sources=replace(after.sources, nuclide_value=table))
         return jax.tree.map(partial(jnp.where, found), after, state), found
 
-    worth = ~adding | (statistic[0] > PROMISING * params.threshold)
+    worth = ~adding | (statistic > PROMISING * params.threshold)
     return jax.lax.cond(worth, look, lambda: (state, jnp.array(False)))
 
 
 def _best(
     problem: Problem,
-    points_m: jax.Array,
-    nuclides: jax.Array,
+    starts: Starts,
     allowed: jax.Array,
     params: SearchParams,
     state: State,
     others: Others,
     slot: jax.Array,
     adding: jax.Array,
-) -> tuple[Tried, jax.Array, jax.Array]:
-    """The best place from some grid points, or from where the source is; its nuclide, and the value of each [N]."""
-    s, known = state.sources, allowed.shape[0]
-    most = max(known, STARTS + 1)
-    u = replace(state.unknowns, activity_bq=jnp.where(adding, 0.0, s.activity_bq[slot]))
-    far = -(-params.screened // SCREENED)
-    # the first round fits the starts, and one in between the nuclides at the best place
-    reaches = jnp.concatenate(
-        [
-            jnp.zeros(1),
-            jnp.full(far, FAR),
-            jnp.array([1.0, 0.5, 0.0]),
-            CLOSING ** jnp.arange(params.rounds, dtype=jnp.float32),
-        ]
-    )
-    naming = far + 3
+    wide: jax.Array,
+) -> tuple[Tried, jax.Array]:
+    """The best place from some grid points, or from where the source is, and the value of each nuclide [N]."""
+    known = allowed.shape[0]
+    size = FITTED * max(PART, -(-known // FITTED))
+    closing = CLOSING ** jnp.arange(1, params.rounds + 1)
+    reaches = params.reach_m * jnp.concatenate([jnp.zeros(BEGINNINGS), jnp.array(REACHES), closing])
+    naming, closer = BEGINNINGS + 1, BEGINNINGS + len(REACHES)
+    first = jnp.where(adding, 0, jnp.where(wide, BEGINNINGS, closer))
+    yes, no = jnp.ones(size, bool), jnp.zeros(size, bool)
+    up_m = 1.5 * problem.height_std_m
 
-    def begin() -> Asked:
-        starts = jnp.concatenate([points_m[:, :2], jnp.broadcast_to(problem.height_m, (STARTS, 1))], axis=1)
-        places = jnp.concatenate([s.place[slot][None], starts])
-        kinds = jnp.append(jnp.where(adding, nuclides[0], s.nuclide[slot]), nuclides)
-        first = jnp.where(adding, 1, 0)  # a new source has no place yet
-        return Asked(
-            place=jnp.pad(jnp.roll(places, -first, axis=0), [(0, most - STARTS - 1), (0, 0)]),
-            nuclide=jnp.pad(jnp.roll(kinds, -first), (0, most - STARTS - 1)),
-            fresh=jnp.arange(most) >= 1 - first,
-            count=STARTS + 1 - first,
-        )
+    def begin(best: Tried, number: jax.Array) -> Candidates:
+        index = FITTED * jnp.minimum(number, BEGINNINGS - 1) + jnp.arange(FITTED)
+        centre = jnp.concatenate([starts.point_m[index, :2], jnp.broadcast_to(problem.height_m, (FITTED, 1))], axis=1)
+        around = jax.vmap(lambda c: spread(c, AROUND * params.grid_m, up_m, size // FITTED, number))(centre)
+        nuclides = jnp.repeat(starts.nuclide[index], size // FITTED)
+        return Candidates(place=around.reshape(-1, 3), nuclide=nuclides, counts=yes, sure=no, apart=yes[0])
 
-    def name(best: Tried) -> Asked:
-        everyone = jnp.argsort(~allowed).astype(jnp.int32)  # the allowed ones first
-        places = jnp.broadcast_to(best.place, (most, 3))
-        everyone = jnp.pad(everyone, (0, most - known))
-        return Asked(place=places, nuclide=everyone, fresh=jnp.ones(most, bool), count=jnp.sum(allowed))
+    def name(best: Tried, number: jax.Array) -> Candidates:
+        everyone = jnp.arange(size, dtype=jnp.int32)
+        places = jnp.broadcast_to(best.place, (size, 3))
+        counts = jnp.pad(allowed, (0, size - known))
+        return Candidates(
+            place=places, nuclide=jnp.minimum(everyone, known - 1), counts=counts, sure=no, apart=no[0]
+        )  # fmt: skip
 
-    Carry = tuple[Tried, jax.Array, jax.Array]
+    def around(best: Tried, number: jax.Array) -> Candidates:
+        reach_m = reaches[number]
+        places = spread(best.place, reach_m, jnp.minimum(reach_m, up_m), size, number.astype(jnp.float32))
+        # the place of a source that is sought again is the first candidate
+        sure = (jnp.arange(size) == 0) & (number == first)
+        places = jnp.where(sure[:, None], best.place, places)
+        return Candidates(
+            place=places, nuclide=jnp.full(size, best.nuclide), counts=yes, sure=sure, apart=yes[0]
+        )  # fmt: skip
 
-    def round_(carry: Carry, x: tuple[jax.Array, jax.Array]) -> tuple[Carry, None]:
-        best, nuclide, values = carry
-        number, reach = x
-        which = jnp.where(number == 0, 0, jnp.where(number == naming, 1, 2))
-        reach_m = reach * params.reach_m
-        asked = jax.lax.switch(
-            which,
-            [
-                begin,
-                lambda: name(best),
-                lambda: promising(problem, nuclide, others, best, reach_m, number, SCREENED, most),
-            ],
-        )
-        skipped = (which == 1) & ~adding
-        asked = replace(asked, count=jnp.where(skipped, 0, asked.count))
-        none = replace(best, fit=replace(best.fit, value=-jnp.asarray(jnp.inf)))
-        before = jax.tree.map(partial(jnp.where, (which == 1) & ~skipped), none, best)
-        start = jax.tree.map(partial(jnp.where, which == 0), u, best.fit.unknowns)
-        best, chosen, found = answered(problem, others, start, asked, before, STEPS)
-        named = (which == 1) & ~skipped
-        table = jnp.full(known, -jnp.inf).at[asked.nuclide].max(found)
-        nuclide = jnp.where(chosen >= 0, asked.nuclide[jnp.maximum(chosen, 0)], nuclide)
-        return (best, nuclide, jnp.where(named, table, values)), None
+    def round_(carry: tuple[jax.Array, Tried, jax.Array]) -> tuple[jax.Array, Tried, jax.Array]:
+        number, best, table = carry
+        named = (number == naming) & (adding | wide)
+        kind = jnp.where(number < BEGINNINGS, 0, jnp.where(named, 1, 2))
+        candidates = jax.lax.switch(kind, [begin, name, around], best, number)
+        u = best.fit.unknowns
+        screen = screen_of(problem, others, best.fit.rates, position_of(problem.site, best.place), u)
+        before = replace(best, fit=replace(best.fit, value=jnp.where(named, -jnp.inf, best.fit.value)))
+        best, values = best_of(problem, others, u, screen, candidates, before)
+        return number + 1, best, jnp.where(named, values[:known], table)
 
-    carry: Carry = (_nowhere(problem, u), s.nuclide[slot], jnp.zeros(known))
-    return jax.lax.scan(round_, carry, (jnp.arange(reaches.shape[0]), reaches))[0]
+    def on(carry: tuple[jax.Array, Tried, jax.Array]) -> jax.Array:
+        number, best, _ = carry
+        ratio = 2.0 * (best.fit.likelihood - state.likelihood)
+        hopeless = adding & (number >= BEGINNINGS) & (ratio < HOPELESS * params.threshold)
+        return (number < reaches.shape[0]) & ~hopeless
+
+    start = (first, _beginning(problem, state, slot, adding), jnp.zeros(known))
+    return jax.lax.while_loop(on, round_, start)[1:]
 
 
-def _nowhere(problem: Problem, u: Unknowns) -> Tried:
-    """A place that is worse than any."""
-    unknown = -jnp.asarray(jnp.inf)
-    shared = 1 + u.others.shape[0] + u.level.shape[0] + u.lengths.shape[0]
+def _beginning(problem: Problem, state: State, slot: jax.Array, adding: jax.Array) -> Tried:
+    """The source as it is known, or none; worse than any place that is fitted."""
+    s, unknown = state.sources, -jnp.asarray(jnp.inf)
+    activity = jnp.maximum(s.activity_bq[slot], 1e-3)
+    n, regions = problem.background.shape
+    shared = 1 + state.unknowns.others.shape[0] + len(problem.detectors) + problem.material_std.shape[0]
     return Tried(
-        place=jnp.zeros(3),
+        place=s.place[slot],
+        nuclide=s.nuclide[slot],
         fit=Settled(
             value=unknown,
             likelihood=unknown,
-            unknowns=u,
+            unknowns=replace(state.unknowns, activity_bq=jnp.where(adding, 0.0, activity)),
             covariance=jnp.eye(shared),
             towards=jnp.eye(3),
-            rates=silent(problem),
+            rates=Rates(
+                counts=jnp.where(adding, 0.0, state.added.counts[slot] / activity),
+                slopes=jnp.zeros((n, problem.material_std.shape[0], regions)),
+                edge=jnp.zeros(n),
+            ),
         ),
     )
 
 
-def _with(problem: Problem, state: State, k: jax.Array, best: Tried, nuclide: jax.Array) -> State:
+def _with(problem: Problem, state: State, k: jax.Array, best: Tried) -> State:
     """The state with source ``k`` as the fit has it."""
     s, u = state.sources, best.fit.unknowns
     sources = replace(
         s,
         place=s.place.at[k].set(best.place),
-        nuclide=s.nuclide.at[k].set(nuclide),
+        nuclide=s.nuclide.at[k].set(best.nuclide),
         activity_bq=(s.activity_bq * u.others).at[k].set(u.activity_bq),
         present=s.present.at[k].set(True),
         towards=s.towards.at[k].set(best.fit.towards),

@@ -14,7 +14,7 @@ from swarmsim.estimation import (
     interpolate,
     localise,
 )
-from swarmsim.estimation.model import Span, spans_of
+from swarmsim.estimation.forward import Span, spans_of
 from swarmsim.estimation.windows import Windows, measured, merged
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey
@@ -26,7 +26,6 @@ from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
 from swarmsim.sensors.radiation import length_factors, sensitivity_factor
 from swarmsim.site import crossed
-from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import World
 
 
@@ -68,9 +67,7 @@ def gathered(
         off = plan.presumed.pose_std_m * jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
         few = replace(few, position_m=few.position_m + few.exposure_s[..., None] * off[:, None])
         parts.append(measured(few, group.counter.index))
-        # what flies is far from what throws shadows
-        rays = 1 if KINDS[group.kind].FLIES else plan.localisation.rays
-        groups.append((parts[-1].counts.shape[0], group.counter.index, rays))
+        groups.append((parts[-1].counts.shape[0], group.counter.index, plan.localisation.rays))
     return concatenate(*parts), spans_of(groups)
 
 

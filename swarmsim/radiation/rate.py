@@ -81,13 +81,18 @@ def net_rate(
 
 
 def observed_rate(detector: Detector, net_cps: jax.Array) -> jax.Array:
-    """Counts per second [...] after dead time, of source and background together.
-
-    Hybrid law m = n exp(-n t_p) / (1 + n t_n) of Lee and Gardner (Applied Radiation and Isotopes 53, 2000, 731), which
-    is the paralyzable law for t_n = 0, the non-paralyzable one for t_p = 0, and no dead time when both are 0.
-    """
+    """Counts per second [...] after dead time, of source and background together (`registered_share`)."""
     rate = net_cps + detector.background_cps
-    return rate * jnp.exp(-rate * detector.paralyzable_s) / (1.0 + rate * detector.non_paralyzable_s)
+    return rate * registered_share(detector, rate)
+
+
+def registered_share(detector: Detector, rate_cps: jax.Array) -> jax.Array:
+    """Share [...] of a true rate [...] of counts per second that is registered.
+
+    Hybrid law m / n = exp(-n t_p) / (1 + n t_n) of Lee and Gardner (Applied Radiation and Isotopes 53, 2000, 731),
+    which is the paralyzable law for t_n = 0, the non-paralyzable one for t_p = 0, and 1 when both are 0.
+    """
+    return jnp.exp(-rate_cps * detector.paralyzable_s) / (1.0 + rate_cps * detector.non_paralyzable_s)
 
 
 def highest_rate(detector: Detector) -> float:
@@ -139,9 +144,14 @@ def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.
 
 
 def roi_rates_and_slopes(
-    detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
+    detector: Detector,
+    source: Source,
+    way: Crossed,
+    position_m: jax.Array,
+    axis: jax.Array,
+    by: tuple[int, ...] = (),
 ) -> tuple[jax.Array, jax.Array]:
-    """`roi_rates` [n, R] of n places, and their derivatives [n, M, R] by ln(length in each material).
+    """`roi_rates` [n, R] of n places, and their derivatives [n, U, R] by ln(length in each material of ``by``).
 
     The derivatives leave out that the spectrum of the scattered photons softens with depth.
 
@@ -150,15 +160,16 @@ def roi_rates_and_slopes(
         source: one.
         way: fields [n, M], from the source to each place.
         position_m, axis: [n, 3] of the crystal.
+        by: numbers of U materials (static).
     """
-    nuclide = source.nuclide
+    nuclide, chosen = source.nuclide, jnp.array(by, jnp.int32)
     seen = jax.vmap(lambda place, along: _seen(detector, source, place, along))(position_m, axis)  # [n, L]
     layers = way.length_m[:, None, :] * detector.attenuation_1_m[nuclide]  # [n, L, M]
     depth = jnp.sum(layers, axis=-1)
     direct = seen * jnp.exp(-depth)
     peaks = detector.peak_rois[nuclide]  # [L, R]
     if detector.kind == "paper_ideal":
-        slopes = -jnp.einsum("nlm,nl,lr->nmr", layers, direct, peaks)
+        slopes = -jnp.einsum("nlu,nl,lr->nur", layers[..., chosen], direct, peaks)
         return direct @ peaks, slopes
     first, last = POSITIONS
     near = jnp.clip((last - way.place) / (last - first), 0.0, 1.0)
@@ -177,7 +188,7 @@ def roi_rates_and_slopes(
     shares = jnp.einsum("nldm,dmlr->nlr", mixed, detector.scattered_rois[nuclide])
     rates = direct @ peaks + jnp.einsum("nl,nlr->nr", scattered, shares)
     each = by_depth[..., None] * shares - direct[..., None] * peaks
-    return rates, jnp.sum(layers[..., None] * each[:, :, None], axis=1)
+    return rates, jnp.sum(layers[..., chosen, None] * each[:, :, None], axis=1)
 
 
 def observed_rois(detector: Detector, net_cps: jax.Array, background: jax.Array | float = 1.0) -> jax.Array:

@@ -115,7 +115,8 @@ def _doubts(
 ) -> list[tuple[Status, str]]:
     """Reasons not to believe the answer, the gravest first."""
     found: list[tuple[Status, str]] = []
-    if fit.misfit > MISFIT_SIGMA and fit.chi_squared > MISFIT_LEAST:
+    # one that cannot be computed contradicts too
+    if not (fit.misfit <= MISFIT_SIGMA or fit.chi_squared <= MISFIT_LEAST):
         found.append((
             "inconsistent",
             f"the counts contradict the sources as modelled (chi-squared {fit.chi_squared:.2f} per degree of freedom, "

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from swarmsim.device import on_processor
 from swarmsim.runtime.clock import Clock
 from swarmsim.runtime.programs import Program, prepare
 from swarmsim.scalars import Layout
@@ -177,7 +178,7 @@ class Spread:
 
 
 def _together() -> int:
-    return 1 if jax.default_backend() == "cpu" else TOGETHER
+    return 1 if on_processor() else TOGETHER
 
 
 def _apply(function: Callable[..., Any], shapes: Any, carried: Any, own: Any, common: Any) -> Any:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
 from swarmsim.site.model import Obstacles, Site
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
-BLOCK = 384  # segments intersected with all boxes at a time, so that the result fits the cache
+BLOCK = 1024  # segments intersected with all boxes at a time, so that the result fits the cache
 VECTOR = 8  # boxes are padded to a multiple of this SIMD width, with empty boxes
 _PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is parallel to the slab
 
@@ -80,7 +81,7 @@ def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     rows = -site.obstacles.wall_m.shape[0] % VECTOR
     boxes = jax.tree.map(lambda x: jnp.pad(x, [(0, rows)] + [(0, 0)] * (x.ndim - 1)), site.obstacles)
     padded = replace(site, obstacles=boxes)
-    size = min(BLOCK, n)
+    size = min(BLOCK, n) if on_processor() else n
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
     found = jax.lax.map(jax.vmap(lambda end: _crossed(padded, above, a, end)), ends)
     return jax.tree.map(lambda x: x.reshape(-1, x.shape[-1])[:n], found)

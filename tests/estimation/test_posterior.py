@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarmsim.config.mission import Knowledge
+from swarmsim.estimation.fit import settle
+from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.posterior import WEIGH_STEPS, Weighed, posteriors, sample_posterior
-from swarmsim.estimation.search import STEPS, attempt
+from swarmsim.estimation.search import attempt
 from swarmsim.estimation.sources import Sources, no_sources
 from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey
 
@@ -80,7 +82,7 @@ def told(boxes, seed):
 def _state(problem, at):
     nothing = no_sources(problem, 1, 1)
     u = replace(nothing.unknowns, activity_bq=jnp.float32(ACTIVITY))
-    fit = attempt(problem, CO_60, nothing.added, u, at, STEPS, True).fit
+    fit = attempt(problem, CO_60, nothing.added, u, at).fit
     sources = Sources(
         place=at[None],
         nuclide=CO_60[None],
@@ -106,7 +108,7 @@ def _grid(problem, state, places):
     u = replace(state.unknowns, activity_bq=state.sources.activity_bq[0])
 
     def one(at):
-        fit = attempt(problem, CO_60, nothing, u, at, WEIGH_STEPS, False).fit
+        fit = settle(problem, ways_from(problem, at), CO_60, nothing, u, WEIGH_STEPS, exact=False)
         return jnp.append(at, jnp.log(fit.unknowns.activity_bq)), fit.value, fit.covariance[0, 0]
 
     return jax.lax.map(one, places)

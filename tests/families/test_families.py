@@ -282,8 +282,8 @@ def test_values_in_the_stead_of_a_family_make_a_single_scenario(standing):
         ("vehicles.uav1.type", "{choice: [x500, tarot_t650]}", "cannot be varied"),
         ("engine", "{choice: [mjx, analytic]}", "cannot be varied"),
         ("phases.survey.policy", "{choice: [orbit]}", "cannot be varied"),
-        ("localisation.starts", "{uniform: [1, 8]}", "changes more than a value"),
-        ("localisation.starts", "{uniform: [1.5, 8]}", "draws fractions"),
+        ("localisation.samples", "{uniform: [16, 80]}", "changes more than a value"),
+        ("localisation.samples", "{uniform: [16.5, 80]}", "draws fractions"),
         ("phases.survey.settings.speed_m_s", "{choice: [2, 20]}", "faster than the vehicle type"),
     ],
 )  # fmt: skip
@@ -333,6 +333,8 @@ def test_the_command_line_shows_and_checks_families(capsys):
     assert "seed 5" in shown
     assert "sources.0.region" in shown
     assert main(["check", "configs/missions/random_recon.yaml"]) == 0
-    assert "a family that varies sources, sources.*.activity_mbq" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "a family that varies" in shown
+    assert "sources.*.activity_mbq, sources.*.height_m" in shown
     assert main(["draw", "recon"]) == 2
     assert "single mission" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from scipy.stats import chi2, kstest
 
 import swarmsim
 from swarmsim.estimation import Measurements, cramer_rao_covariance, fisher_information, localise
-from swarmsim.estimation.model import spans_of
+from swarmsim.estimation.forward import spans_of
 from swarmsim.estimation.windows import gather, measured, merged, windows_start
 from swarmsim.radiation import draw_counts, observed_rois
 from swarmsim.radiation.background import background_factor
@@ -22,7 +22,6 @@ pytestmark = pytest.mark.optimised
 SEEDS = 32
 # Fewer rounds and places than a mission takes: the bound is asked for within 30 %, and there are many fits.
 QUICK = (
-    "localisation.screened=48",
     "localisation.search_rounds=3",
     "localisation.sample_rounds=4",
     "localisation.samples=32",

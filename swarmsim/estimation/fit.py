@@ -12,68 +12,42 @@ their square. The value at a place is the logarithm of the posterior after all o
 approximation): the shape of the spectrum then tells a source from a background that varies from place to place.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.likelihood import height_precision, scaled_inverse, travel_gain
-from swarmsim.estimation.measurements import Measurements
-from swarmsim.pytree import pytree, static
-from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.rate import roi_rates_and_slopes
-from swarmsim.site import Site, sample
-from swarmsim.site.rays import Crossed, crossed_from
+from swarmsim.estimation.forward import (
+    Problem,
+    Rates,
+    Ways,
+    dead_time,
+    detector_of,
+    lengthened,
+    rates,
+    silent,
+    variance_of,
+)
+from swarmsim.estimation.likelihood import height_precision, poisson_log_likelihood, scaled_inverse
+from swarmsim.pytree import pytree
+from swarmsim.site import sample
 
 MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count finite
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
-EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
 LOOSE = 1e-4  # precision of what has no prior
-
-
-Span = tuple[int, int, int, int]
-"""Rows from, to, their detector model, and the rays to each window along its way."""
-
-
-@pytree
-class Problem:
-    """Everything that the estimate of sources is conditioned on."""
-
-    site: Site
-    detectors: tuple[Detector, ...]
-    measurements: Measurements  # n windows, detector by detector; ``rois`` [n, R]
-    background: jax.Array  # [n, R] counts expected at the nominal level, over an even ground
-    material_std: jax.Array  # [M] prior of ln(true over presumed length); 0: exact
-    background_std: jax.Array  # [] of a window's ln(background over the detector's level)
-    model_std: jax.Array  # [] of a window's ln(true over modelled rate of the sources)
-    pose_std_m: jax.Array  # [n] of a window's place
-    height_m: jax.Array  # [] prior of a source's height above ground
-    height_std_m: jax.Array  # []
-    spans: tuple[Span, ...] = static()
 
 
 @pytree
 class Unknowns:
-    """What is fitted at a place; K sources, D detector models, M materials, n windows."""
+    """What is fitted at a place; K sources, D detector models, U materials, n windows."""
 
     activity_bq: jax.Array  # [] of the source whose place is given
     others: jax.Array  # [K] factors of the other sources' rates
     level: jax.Array  # [D] ln(background over nominal)
-    lengths: jax.Array  # [M] ln(true over presumed length)
+    lengths: jax.Array  # [U] ln(true over presumed length) in each uncertain material
     background: jax.Array  # [n] deviation of ln(background)
     gain: jax.Array  # [n] deviation of ln(rate of the sources)
-
-
-@pytree
-class Rates:
-    """What a source of 1 Bq adds, before dead time."""
-
-    counts: jax.Array  # [n, R]
-    slopes: jax.Array  # [n, M, R] their derivatives by ln(length in each material)
-    edge: jax.Array  # [n] variance of their logarithm from shadows' edges that the window crosses
 
 
 @pytree
@@ -96,113 +70,6 @@ class Others:
     variance: jax.Array  # [K, n] of ln(true over modelled rate)
 
 
-@pytree
-class Ways:
-    """What lies between a place and the windows."""
-
-    crossed: tuple[Crossed, ...]  # for each span [rays m, M]
-    position_m: jax.Array  # [3] of the place
-
-
-def position_of(site: Site, place: jax.Array) -> jax.Array:
-    """World position [3] of ``place`` [3] (x, y, height above the ground)."""
-    return jnp.stack([place[0], place[1], sample(site.terrain_m, site, place[:2]) + place[2]])
-
-
-def crystals(problem: Problem, span: Span) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Places [rays m, 3] along the ways of a span's m windows, the crystal's axes there, and the shares of each [rays].
-
-    With one ray a window has its middle; with more the first and the last end of the way are among them, so that a
-    shadow's edge that a window crosses is seen in the spread between its rays.
-    """
-    first, last, _, rays = span
-    m = problem.measurements
-    position, travel, axis = (x[first:last] for x in (m.position_m, m.travel_m, m.axis))
-    if rays == 1:
-        return position, axis, jnp.ones(1)
-    node = jnp.linspace(-0.5, 0.5, rays)
-    share = jnp.ones(rays).at[jnp.array([0, rays - 1])].set(0.5) / (rays - 1)
-    along = position[:, None] + node[:, None] * travel[:, None]
-    return along.reshape(-1, 3), jnp.repeat(axis, rays, axis=0), share
-
-
-def ways_from(problem: Problem, place: jax.Array) -> Ways:
-    """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
-    position, materials = position_of(problem.site, place), len(problem.site.material_names)
-    found = []
-    for span in problem.spans:
-        ends = crystals(problem, span)[0]
-        zero = jnp.zeros((ends.shape[0], materials))
-        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
-        found.append(
-            jax.lax.cond(
-                used,
-                lambda ends=ends: crossed_from(problem.site, position, ends),
-                lambda zero=zero: Crossed(length_m=zero, place=zero),
-            )
-        )
-    return Ways(crossed=tuple(found), position_m=position)
-
-
-def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) -> Rates:
-    """Counts per Bq of a source of ``nuclide``; ``lengths`` [M] are logarithms of the factors of the path lengths."""
-    source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
-    parts = []
-    for span, crossed in zip(problem.spans, ways.crossed, strict=True):
-        way = Crossed(length_m=crossed.length_m * jnp.exp(lengths), place=crossed.place)
-
-        def seen(span: Span = span, way: Crossed = way) -> Rates:
-            return _rates_of_span(problem, span, source, way)
-
-        def nothing(seen: Any = seen) -> Any:
-            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen))
-
-        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
-        parts.append(jax.lax.cond(used, seen, nothing))
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-
-
-def _rates_of_span(problem: Problem, span: Span, source: Source, way: Crossed) -> Rates:
-    first, last, number, rays = span
-    position, axis, share = crystals(problem, span)
-    offset = position - source.position_m
-    rate, slope = roi_rates_and_slopes(problem.detectors[number], source, way, position, axis)
-    m = problem.measurements
-    gain = travel_gain(offset, m.travel_m[first:last]) if rays == 1 else jnp.ones(offset.shape[0])
-    exposure = m.exposure_s[first:last]
-
-    def over_windows(x: jax.Array) -> jax.Array:
-        ones = [1] * (x.ndim - 1)
-        each = (x * gain.reshape(-1, *ones)).reshape(-1, rays, *x.shape[1:])
-        mean = jnp.sum(each * share.reshape(-1, *ones), axis=1)
-        return padded(mean, problem.background.shape[1]) * exposure.reshape(-1, *ones)
-
-    strength = (jnp.sum(rate, axis=1) * jnp.sum(offset * offset, axis=1)).reshape(-1, rays)
-    mean = jnp.sum(share * strength, axis=1)
-    spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)
-    edge = EDGE_SHARE * jnp.where(mean > 0.0, spread, 0.0)
-    return Rates(counts=over_windows(rate), slopes=over_windows(slope), edge=edge)
-
-
-def padded(values: jax.Array, regions: int) -> jax.Array:
-    """The same with zeros up to so many regions on the last axis."""
-    return jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, regions - values.shape[-1])])
-
-
-def dead_time(problem: Problem, counts: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Share [n] of the true counts [n] of each window that is registered, and its derivative by them."""
-    exposure = jnp.maximum(problem.measurements.exposure_s, 1e-9)
-    shares, slopes = [], []
-    for first, last, number, _ in problem.spans:
-        d, live = problem.detectors[number], exposure[first:last]
-        rate = counts[first:last] / live
-        share = jnp.exp(-rate * d.paralyzable_s) / (1.0 + rate * d.non_paralyzable_s)
-        fall = d.paralyzable_s + d.non_paralyzable_s / (1.0 + rate * d.non_paralyzable_s)
-        shares.append(share)
-        slopes.append(-share * fall / live)
-    return jnp.concatenate(shares), jnp.concatenate(slopes)
-
-
 def nothing_known(problem: Problem, sources: int) -> Unknowns:
     """Where fits start: nominal background, presumed materials."""
     n = problem.background.shape[0]
@@ -217,7 +84,7 @@ def nothing_known(problem: Problem, sources: int) -> Unknowns:
 
 
 @pytree
-class _Linear:
+class Linearised:
     """Means, and how they change with the unknowns."""
 
     mean: jax.Array  # [n, R]
@@ -225,15 +92,10 @@ class _Linear:
     own: jax.Array  # [n, R, 2] by the window's background and gain
     moved: jax.Array  # [n, R, 3] by the place
     precision: jax.Array  # [n, 2] of the priors of the window's own unknowns
+    registered: jax.Array  # [n] derivative of the registered counts of a window by the true ones
 
 
-def detector_of(problem: Problem) -> jax.Array:
-    """One-hot [n, D]: the detector model of each row."""
-    rows = [jnp.full(last - first, number) for first, last, number, _ in problem.spans]
-    return jax.nn.one_hot(jnp.concatenate(rows), len(problem.detectors))
-
-
-def _linear(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> _Linear:
+def linearised(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Linearised:
     """The model at ``u``, with the rates of the source at ``where`` [3]."""
     gain = jnp.exp(u.gain)[:, None]
     own = u.activity_bq * source.counts * gain
@@ -256,20 +118,14 @@ def _linear(problem: Problem, source: Rates, others: Others, where: jax.Array, u
     offset = where - problem.measurements.position_m
     squared = jnp.maximum(jnp.sum(offset * offset, axis=-1, keepdims=True), 0.01)
     moved = own[..., None] * (-2.0 * offset / squared)[:, None]
-    return _Linear(
+    return Linearised(
         mean=share[:, None] * true,
         common=seen(common),
         own=seen(jnp.stack([background, signal], axis=-1)),
         moved=seen(moved),
+        registered=share + fall * total,
         precision=_precision(problem, jnp.sum(own, axis=1), jnp.sum(rest, axis=2), others, where, source.edge),
     )
-
-
-def variance_of(problem: Problem, where: jax.Array) -> jax.Array:
-    """Variance [n] of ln(true over modelled rate) of a source at ``where`` [3], from the model and the poses."""
-    offset = where - problem.measurements.position_m
-    squared = jnp.maximum(jnp.sum(offset * offset, axis=-1), 0.01)
-    return jnp.square(problem.model_std) + 4.0 * jnp.square(problem.pose_std_m) / squared
 
 
 def _precision(
@@ -284,7 +140,7 @@ def _precision(
     return 1.0 / jnp.clip(jnp.stack([background, variance], axis=-1), 1e-6, 1.0)
 
 
-def _prior(problem: Problem, sources: int) -> jax.Array:
+def prior_precision(problem: Problem, sources: int) -> jax.Array:
     """Precisions [P] of the unknowns that windows share."""
     loose = jnp.full(1 + sources + len(problem.detectors), LOOSE)
     lengths = 1.0 / jnp.square(jnp.maximum(problem.material_std, 1e-3))
@@ -292,13 +148,13 @@ def _prior(problem: Problem, sources: int) -> jax.Array:
 
 
 def _common(u: Unknowns) -> jax.Array:
-    """The unknowns that have a prior about zero, in the order of `_prior`; zero for those without."""
+    """The unknowns that have a prior about zero, in the order of `prior_precision`; zero for those without."""
     free = jnp.zeros(1 + u.others.shape[0] + u.level.shape[0])
     return jnp.concatenate([free, u.lengths])
 
 
 @pytree
-class _Normal:
+class NormalEquations:
     """Normal equations at some unknowns."""
 
     information: jax.Array  # [P, P] the windows' own unknowns eliminated, priors included
@@ -311,13 +167,14 @@ class _Normal:
     fitted: jax.Array  # [] how many of them the data determine
 
 
-def _normal(problem: Problem, model: _Linear, u: Unknowns) -> _Normal:
+def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> NormalEquations:
+    """The normal equations at ``u``, where ``model`` is linearised."""
     m = problem.measurements
     assert m.rois is not None
     weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
     left = weight * (m.rois - model.mean)
-    common_precision, own_precision = _prior(problem, u.others.shape[0]), model.precision
-    nuisance = jnp.stack([u.background, u.gain], axis=-1)
+    common_precision, own_precision = prior_precision(problem, u.others.shape[0]), model.precision
+    nuisance = window_unknowns(u)
     columns = jnp.concatenate([model.common, model.moved], axis=-1)
     # products of a few numbers for each window are written as sums: a batched matrix product would be slower
     weighted = model.own * weight[..., None]
@@ -336,7 +193,7 @@ def _normal(problem: Problem, model: _Linear, u: Unknowns) -> _Normal:
     information = whole[:p, :p] + jnp.diag(common_precision)
     across = whole[:p, p:]
     inverse = scaled_inverse(information)
-    return _Normal(
+    return NormalEquations(
         information=information,
         push=push[:p] - common_precision * _common(u),
         own=own,
@@ -348,7 +205,7 @@ def _normal(problem: Problem, model: _Linear, u: Unknowns) -> _Normal:
     )
 
 
-def _moved(problem: Problem, u: Unknowns, at: _Normal) -> Unknowns:
+def stepped(problem: Problem, u: Unknowns, at: NormalEquations) -> Unknowns:
     """The unknowns after a Gauss-Newton step."""
     step = jnp.clip(scaled_inverse(at.information) @ at.push, -LONGEST_STEP, LONGEST_STEP)
     own = jnp.einsum("nab,nb->na", at.own, at.own_push - jnp.einsum("nap,p->na", at.crossing, step))
@@ -364,13 +221,23 @@ def _moved(problem: Problem, u: Unknowns, at: _Normal) -> Unknowns:
     )
 
 
-def _log_likelihood(counts: jax.Array, mean: jax.Array, valid: jax.Array) -> jax.Array:
-    """Of Poisson counts [n, R], relative to the saturated model: small terms, which float32 can add up."""
-    mean = jnp.maximum(mean, MEAN_FLOOR)
-    safe = jnp.where(counts > 0.0, counts, 1.0)
-    ratio = jnp.maximum((mean - safe) / safe, -0.999999)
-    seen = safe * (jnp.log1p(ratio) - ratio)
-    return jnp.sum(jnp.where(valid[:, None], jnp.where(counts > 0.0, seen, -mean), 0.0))
+def log_likelihood(problem: Problem, model: Linearised) -> jax.Array:
+    """Log likelihood [] of the counts, relative to the saturated model."""
+    m = problem.measurements
+    assert m.rois is not None
+    return poisson_log_likelihood(m.rois, jnp.maximum(model.mean, MEAN_FLOOR), m.valid[:, None])
+
+
+def window_unknowns(u: Unknowns) -> jax.Array:
+    """The unknowns [n, 2] that each window has to itself: background and gain."""
+    return jnp.stack([u.background, u.gain], axis=-1)
+
+
+def log_prior(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
+    """Log prior [] of the unknowns but the place, up to a constant."""
+    shared = prior_precision(problem, u.others.shape[0]) * jnp.square(_common(u))
+    own = jnp.where(problem.measurements.valid[:, None], model.precision * jnp.square(window_unknowns(u)), 0.0)
+    return -0.5 * (jnp.sum(shared) + jnp.sum(own))
 
 
 def settle(
@@ -380,7 +247,9 @@ def settle(
     others: Others,
     start: Unknowns,
     steps: int,
-    fresh: jax.Array | bool = False,
+    *,
+    fresh: bool = False,
+    exact: bool = True,
 ) -> Settled:
     """Fit all unknowns for a source of ``nuclide`` at the place that ``ways`` lead from.
 
@@ -391,38 +260,34 @@ def settle(
         others: other sources.
         start: where to begin.
         steps: of Gauss-Newton (static).
-        fresh: [] bool, whether the activity is not known from ``start``: the first one is that which fits best if
-            all else is held.
+        fresh: whether the activity is not known from ``start``: the first one is that which fits best if all else is
+            held (static).
+        exact: whether the rates are computed again with the lengths that were fitted; else they are extrapolated
+            (`lengthened`; static).
     """
-    m = problem.measurements
-    assert m.rois is not None
     source = rates(problem, ways, nuclide, start.lengths)
-    first = _first_activity(problem, source, others, start)
-    start = replace(start, activity_bq=jnp.where(fresh, first, start.activity_bq))
+    if fresh:
+        start = replace(start, activity_bq=_first_activity(problem, source, others, start))
 
-    def linear(u: Unknowns, source: Rates) -> _Linear:
-        return _linear(problem, source, others, ways.position_m, u)
+    def linear(u: Unknowns, source: Rates) -> Linearised:
+        return linearised(problem, source, others, ways.position_m, u)
 
-    def step(carry: tuple[Unknowns, Rates], _: None) -> tuple[Any, None]:
+    def step(carry: tuple[Unknowns, Rates], _: None) -> tuple[tuple[Unknowns, Rates], None]:
         u, source = carry
-        u = _moved(problem, u, _normal(problem, linear(u, source), u))
-        return (u, rates(problem, ways, nuclide, u.lengths)), None
+        moved = stepped(problem, u, normal_equations(problem, linear(u, source), u))
+        return (moved, lengthened(source, moved.lengths - u.lengths)), None
 
     (u, source), _ = jax.lax.scan(step, (start, source), None, length=steps)
+    if exact and problem.uncertain:
+        source = rates(problem, ways, nuclide, u.lengths)
     return _settled(problem, linear(u, source), u, ways, source)
 
 
-def _settled(problem: Problem, model: _Linear, u: Unknowns, ways: Ways, source: Rates) -> Settled:
-    m = problem.measurements
-    assert m.rois is not None
-    at = _normal(problem, model, u)
-    common_precision = _prior(problem, u.others.shape[0])
-    own = jnp.stack([u.background, u.gain], axis=-1)
-    penalty = jnp.sum(common_precision * jnp.square(_common(u)))
-    penalty = penalty + jnp.sum(jnp.where(m.valid[:, None], model.precision * jnp.square(own), 0.0))
+def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, source: Rates) -> Settled:
+    at = normal_equations(problem, model, u)
     height = ways.position_m[2] - sample(problem.site.terrain_m, problem.site, ways.position_m[:2])
-    penalty = penalty + height_precision(problem.height_std_m) * jnp.square(height - problem.height_m)
-    likelihood = _log_likelihood(m.rois, model.mean, m.valid) - 0.5 * penalty
+    of_height = height_precision(problem.height_std_m) * jnp.square(height - problem.height_m)
+    likelihood = log_likelihood(problem, model) + log_prior(problem, model, u) - 0.5 * of_height
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(at.information), 1e-20))
     unit = at.information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
     root = jax.scipy.linalg.cholesky(unit, lower=True)
@@ -438,18 +303,11 @@ def _settled(problem: Problem, model: _Linear, u: Unknowns, ways: Ways, source: 
     )
 
 
-def silent(problem: Problem) -> Rates:
-    """Rates of no source."""
-    n, regions = problem.background.shape
-    materials = problem.material_std.shape[0]
-    return Rates(counts=jnp.zeros((n, regions)), slopes=jnp.zeros((n, materials, regions)), edge=jnp.zeros(n))
-
-
 def _first_activity(problem: Problem, source: Rates, others: Others, u: Unknowns) -> jax.Array:
     """Activity [] of least squares with everything else held, at least what gives ten counts in all."""
     m, net = problem.measurements, source.counts
     assert m.rois is not None
-    model = _linear(problem, silent(problem), others, jnp.zeros(3), replace(u, activity_bq=jnp.zeros(())))
+    model = linearised(problem, silent(problem), others, jnp.zeros(3), replace(u, activity_bq=jnp.zeros(())))
     # a background that varies is part of the variance, as if it did so in each region by itself
     variance = model.mean + jnp.square(problem.background_std * model.mean)
     weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(variance, MEAN_FLOOR), 0.0)
@@ -458,14 +316,20 @@ def _first_activity(problem: Problem, source: Rates, others: Others, u: Unknowns
     return jnp.maximum(score / jnp.maximum(information, 1e-30), least)
 
 
-def spans_of(groups: Sequence[tuple[int, int, int]]) -> tuple[Span, ...]:
-    """Spans from (rows, detector, rays) of groups that follow one another; neighbours that are alike are one span."""
-    spans: list[Span] = []
-    at = 0
-    for size, detector, rays in groups:
-        if spans and spans[-1][2:] == (detector, rays):
-            spans[-1] = (spans[-1][0], at + size, detector, rays)
-        elif size:
-            spans.append((at, at + size, detector, rays))
-        at += size
-    return tuple(spans)
+def alone(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, Linearised]:
+    """Best unknowns with the sources ``others`` alone, and the model there."""
+
+    def model(u: Unknowns) -> Linearised:
+        return linearised(problem, silent(problem), others, jnp.zeros(3), u)
+
+    def step(u: Unknowns, _: None) -> tuple[Unknowns, None]:
+        return stepped(problem, u, normal_equations(problem, model(u), u)), None
+
+    u = jax.lax.scan(step, replace(u, activity_bq=jnp.zeros(())), None, length=steps)[0]
+    return u, model(u)
+
+
+def without_more(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, jax.Array]:
+    """Best unknowns with the sources ``others`` alone, and the likelihood with the priors."""
+    u, model = alone(problem, others, u, steps)
+    return u, log_likelihood(problem, model) + log_prior(problem, model, u)

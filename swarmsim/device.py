@@ -1,0 +1,22 @@
+"""What the device that computes is good at."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+
+In = TypeVar("In")
+Out = TypeVar("Out")
+
+
+def on_processor() -> bool:
+    """Whether arrays live on the processor: a core is fastest with work that fits its cache, one piece after another.
+
+    An accelerator wants as much as possible at a time.
+    """
+    return jax.default_backend() == "cpu"
+
+
+def each(function: Callable[[In], Out], values: In, together: int) -> Out:
+    """``function`` of every element of the leading axis; ``together`` (static) of them at a time on an accelerator."""
+    return jax.lax.map(function, values, batch_size=None if on_processor() else together)

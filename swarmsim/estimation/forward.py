@@ -1,0 +1,227 @@
+"""What sources add to the counts by region of interest: rays, transport, and the way of the crystal in a window."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.estimation.likelihood import position_of, travel_gain
+from swarmsim.estimation.measurements import Measurements
+from swarmsim.pytree import pytree, static
+from swarmsim.radiation.detector import Detector, Source
+from swarmsim.radiation.rate import registered_share, roi_rates_and_slopes
+from swarmsim.site import Site, sample
+from swarmsim.site.rays import Crossed, crossed_from
+
+LEAST_ABOVE_M = 0.2  # height of a crystal above the ground
+EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
+
+
+Span = tuple[int, int, int, int]
+"""Rows from, to, their detector model, and the rays to each window along its way."""
+
+
+@pytree
+class Nodes:
+    """Where the crystal is looked at from a source: ``rays`` places of each of m windows."""
+
+    position_m: jax.Array  # [rays m, 3]
+    axis: jax.Array  # [rays m, 3]
+
+
+@pytree
+class Problem:
+    """Everything that the estimate of sources is conditioned on."""
+
+    site: Site
+    detectors: tuple[Detector, ...]
+    measurements: Measurements  # n windows, detector by detector; ``rois`` [n, R]
+    background: jax.Array  # [n, R] counts expected at the nominal level, over an even ground
+    material_std: jax.Array  # [U] prior of ln(true over presumed length) in each uncertain material
+    background_std: jax.Array  # [] of a window's ln(background over the detector's level)
+    model_std: jax.Array  # [] of a window's ln(true over modelled rate of the sources)
+    pose_std_m: jax.Array  # [n] of a window's place
+    height_m: jax.Array  # [] prior of a source's height above ground
+    height_std_m: jax.Array  # []
+    nodes: tuple[Nodes, ...]  # of each span
+    spans: tuple[Span, ...] = static()
+    uncertain: tuple[int, ...] = static()  # numbers of the U materials whose thickness is not known exactly
+
+
+@pytree
+class Rates:
+    """What a source of 1 Bq adds, before dead time."""
+
+    counts: jax.Array  # [n, R]
+    slopes: jax.Array  # [n, U, R] their derivatives by ln(length in each uncertain material)
+    edge: jax.Array  # [n] variance of their logarithm from shadows' edges that the window crosses
+
+
+@pytree
+class Ways:
+    """What lies between a place and the windows."""
+
+    crossed: tuple[Crossed, ...]  # for each span [rays m, M]
+    position_m: jax.Array  # [3] of the place
+
+
+def nodes_of(site: Site, m: Measurements, span: Span) -> Nodes:
+    """The nodes of a span's windows.
+
+    With one ray a window has its middle; with more the first and the last end of the way are among them, so that a
+    shadow's edge that a window crosses is seen in the spread between its rays. The way of a vehicle that takes off or
+    turns is not straight: no end is taken to lie below the ground.
+    """
+    first, last, _, rays = span
+    position, travel, axis = (x[first:last] for x in (m.position_m, m.travel_m, m.axis))
+    if rays == 1:
+        return Nodes(position_m=position, axis=axis)
+    node = jnp.linspace(-0.5, 0.5, rays)
+    along = (position[:, None] + node[:, None] * travel[:, None]).reshape(-1, 3)
+    ground = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(along[:, :2])
+    along = along.at[:, 2].max(ground + LEAST_ABOVE_M)
+    return Nodes(position_m=along, axis=jnp.repeat(axis, rays, axis=0))
+
+
+def shares_of(rays: int) -> jax.Array:
+    """Weights [rays] of a window's nodes (trapezoidal rule)."""
+    if rays == 1:
+        return jnp.ones(1)
+    return jnp.ones(rays).at[jnp.array([0, rays - 1])].set(0.5) / (rays - 1)
+
+
+def ways_from(problem: Problem, place: jax.Array) -> Ways:
+    """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
+    position, materials = position_of(problem.site, place), len(problem.site.material_names)
+    found = []
+    for span, nodes in zip(problem.spans, problem.nodes, strict=True):
+        ends = nodes.position_m
+        zero = jnp.zeros((ends.shape[0], materials))
+        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
+        found.append(
+            jax.lax.cond(
+                used,
+                lambda ends=ends: crossed_from(problem.site, position, ends),
+                lambda zero=zero: Crossed(length_m=zero, place=zero),
+            )
+        )
+    return Ways(crossed=tuple(found), position_m=position)
+
+
+def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) -> Rates:
+    """Counts per Bq of a source of ``nuclide``.
+
+    ``lengths`` [U] are logarithms of the factors of the path lengths in the uncertain materials.
+    """
+    materials = len(problem.site.material_names)
+    factors = jnp.ones(materials).at[jnp.array(problem.uncertain, jnp.int32)].set(jnp.exp(lengths))
+    source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
+    parts = []
+    for span, crossed in zip(problem.spans, ways.crossed, strict=True):
+        way = Crossed(length_m=crossed.length_m * factors, place=crossed.place)
+
+        def seen(span: Span = span, way: Crossed = way) -> Rates:
+            return _rates_of_span(problem, span, source, way)
+
+        def nothing(seen: Any = seen) -> Any:
+            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen))
+
+        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
+        parts.append(jax.lax.cond(used, seen, nothing))
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+def _rates_of_span(problem: Problem, span: Span, source: Source, way: Crossed) -> Rates:
+    first, last, number, rays = span
+    nodes, share = problem.nodes[problem.spans.index(span)], shares_of(rays)
+    position, axis = nodes.position_m, nodes.axis
+    offset = position - source.position_m
+    detector = problem.detectors[number]
+    rate, slope = roi_rates_and_slopes(detector, source, way, position, axis, problem.uncertain)
+    m = problem.measurements
+    gain = travel_gain(offset, m.travel_m[first:last]) if rays == 1 else jnp.ones(offset.shape[0])
+    exposure = m.exposure_s[first:last]
+
+    def over_windows(x: jax.Array) -> jax.Array:
+        ones = [1] * (x.ndim - 1)
+        each = (x * gain.reshape(-1, *ones)).reshape(exposure.shape[0], rays, *x.shape[1:])
+        mean = jnp.sum(each * share.reshape(-1, *ones), axis=1)
+        return padded(mean, problem.background.shape[1]) * exposure.reshape(-1, *ones)
+
+    strength = (jnp.sum(rate, axis=1) * jnp.sum(offset * offset, axis=1)).reshape(-1, rays)
+    mean = jnp.sum(share * strength, axis=1)
+    spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)
+    edge = EDGE_SHARE * jnp.where(mean > 0.0, spread, 0.0)
+    return Rates(counts=over_windows(rate), slopes=over_windows(slope), edge=edge)
+
+
+def padded(values: jax.Array, regions: int) -> jax.Array:
+    """The same with zeros up to so many regions on the last axis."""
+    return jnp.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, regions - values.shape[-1])])
+
+
+def dead_time(problem: Problem, counts: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Share [n] of the true counts [n] of each window that is registered, and its derivative by them."""
+    exposure = jnp.maximum(problem.measurements.exposure_s, 1e-9)
+    shares, slopes = [], []
+    for first, last, number, _ in problem.spans:
+        live, law = exposure[first:last], partial(registered_share, problem.detectors[number])
+        rate = counts[first:last] / live
+        share, slope = jax.jvp(law, (rate,), (1.0 / live,))
+        shares.append(share)
+        slopes.append(slope)
+    return jnp.concatenate(shares), jnp.concatenate(slopes)
+
+
+def lengthened(source: Rates, change: jax.Array) -> Rates:
+    """The rates after the logarithms of the lengths have changed by ``change`` [U].
+
+    Exact for photons of one energy that do not scatter: their logarithm is linear in the lengths.
+    """
+    further = jnp.sum(source.slopes * jnp.expm1(change)[:, None], axis=1) / jnp.maximum(source.counts, 1e-30)
+    factor = jnp.exp(jnp.clip(further, -20.0, 20.0))
+    slopes = source.slopes * (jnp.exp(change)[:, None] * factor[:, None])
+    return replace(source, counts=source.counts * factor, slopes=slopes)
+
+
+def with_one_ray(problem: Problem) -> Problem:
+    """The same with one ray to each window."""
+    spans = tuple((first, last, number, 1) for first, last, number, _ in problem.spans)
+    nodes = tuple(nodes_of(problem.site, problem.measurements, span) for span in spans)
+    return replace(problem, spans=spans, nodes=nodes)
+
+
+def silent(problem: Problem) -> Rates:
+    """Rates of no source."""
+    n, regions = problem.background.shape
+    materials = problem.material_std.shape[0]
+    return Rates(counts=jnp.zeros((n, regions)), slopes=jnp.zeros((n, materials, regions)), edge=jnp.zeros(n))
+
+
+def variance_of(problem: Problem, where: jax.Array) -> jax.Array:
+    """Variance [n] of ln(true over modelled rate) of a source at ``where`` [3], from the model and the poses."""
+    offset = where - problem.measurements.position_m
+    squared = jnp.maximum(jnp.sum(offset * offset, axis=-1), 0.01)
+    return jnp.square(problem.model_std) + 4.0 * jnp.square(problem.pose_std_m) / squared
+
+
+def detector_of(problem: Problem) -> jax.Array:
+    """One-hot [n, D]: the detector model of each row."""
+    rows = [jnp.full(last - first, number) for first, last, number, _ in problem.spans]
+    return jax.nn.one_hot(jnp.concatenate(rows), len(problem.detectors))
+
+
+def spans_of(groups: Sequence[tuple[int, int, int]]) -> tuple[Span, ...]:
+    """Spans from (rows, detector, rays) of groups that follow one another; neighbours that are alike are one span."""
+    spans: list[Span] = []
+    at = 0
+    for size, detector, rays in groups:
+        if spans and spans[-1][2:] == (detector, rays):
+            spans[-1] = (spans[-1][0], at + size, detector, rays)
+        elif size:
+            spans.append((at, at + size, detector, rays))
+        at += size
+    return tuple(spans)
