@@ -18,5 +18,10 @@ def on_processor() -> bool:
 
 
 def each(function: Callable[[In], Out], values: In, together: int) -> Out:
-    """``function`` of every element of the leading axis; ``together`` (static) of them at a time on an accelerator."""
-    return jax.lax.map(function, values, batch_size=None if on_processor() else together)
+    """``function`` of every element of the leading axis; up to ``together`` (static) at a time on an accelerator."""
+    if on_processor():
+        return jax.lax.map(function, values)
+    count = jax.tree.leaves(values)[0].shape[0]
+    # equal parts: a rest would be compiled as well
+    size = max(n for n in range(1, min(together, count) + 1) if count % n == 0)
+    return jax.lax.map(function, values, batch_size=size)

@@ -29,7 +29,7 @@ GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
 FITTED = 4  # of the candidates of a round: the best of each part
 STEPS = 3  # Gauss-Newton steps at a place
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
-TOGETHER = 16  # places that an accelerator looks at side by side
+TOGETHER = 24  # places that an accelerator looks at side by side
 
 Bounds = tuple[jax.Array, jax.Array]  # lower and upper [3]
 

@@ -1,12 +1,15 @@
 """What a straight line crosses: the length in each material, and where along the line it lies."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
+from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
@@ -48,16 +51,12 @@ def above_of(site: Site) -> Ceilings:
     return ceilings(site.terrain_m) if site.above is None else site.above
 
 
-def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array) -> Crossed:
+def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes | None" = None) -> Crossed:
     direction = b - a
     squared = jnp.sum(direction * direction)
     distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
-    one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
-    # Matrix product: a masked sum would dominate the cost.
-    share, moment = _box_fractions(site.obstacles, a, direction)
-    stacked = jnp.stack([share, jax.lax.stop_gradient(moment)])
-    fractions, moments = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
+    fractions, moments = (boxes or _all_boxes)(site, a, direction)
     # A function with its own derivative takes no arrays of the host, as the values of a world are: add nothing to them.
     soil, soil_place = share_below(site, above, jnp.add(a, 0.0), jnp.add(b, 0.0))
     ground = materials == site.ground_material
@@ -73,18 +72,67 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array) -> Crossed
 
 
 def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
-    """`crossed` [n] of the segments from ``a`` [3] to each of ``b`` [n, 3], in blocks that fit the cache.
+    """`crossed` [n] of the segments from ``a`` [3] to each of ``b`` [n, 3], in the way that suits the device."""
+    return _in_blocks(site, a, b) if on_processor() else by_threads(site, a, b)
 
-    Segments that take about as many steps over the terrain cost least side by side: sort them by their height.
-    """
+
+def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
+    """In blocks that fit the cache, the boxes as the vectorised axis."""
     n, above = b.shape[0], above_of(site)
     rows = -site.obstacles.wall_m.shape[0] % VECTOR
     boxes = jax.tree.map(lambda x: jnp.pad(x, [(0, rows)] + [(0, 0)] * (x.ndim - 1)), site.obstacles)
     padded = replace(site, obstacles=boxes)
-    size = min(BLOCK, n) if on_processor() else n
+    size = min(BLOCK, n)
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
     found = jax.lax.map(jax.vmap(lambda end: _crossed(padded, above, a, end)), ends)
     return jax.tree.map(lambda x: x.reshape(-1, x.shape[-1])[:n], found)
+
+
+def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = None) -> Crossed:
+    """`crossed_from` with a thread for each segment, which goes through the boxes and over the terrain by itself.
+
+    ``platform`` is that of `swarmsim.scalars.over_vehicles`.
+    """
+    above, boxes = above_of(site), site.obstacles
+    shared = (boxes, site.terrain_m, above.highest_m, site.origin_m, site.cell_m, site.ground_material)
+
+    def one(end: jax.Array, start: jax.Array, shared: Any) -> Crossed:
+        boxes, terrain, highest, origin, cell, ground = shared
+        here = replace(
+            site, obstacles=boxes, terrain_m=terrain, origin_m=origin, cell_m=cell, ground_material=ground
+        )  # fmt: skip
+        return _crossed(here, replace(above, highest_m=highest), start, end, _box_after_box)
+
+    starts = jnp.broadcast_to(a, b.shape)
+    found: Crossed = over_vehicles(one, (0, 0, None), platform=platform)(b, starts, shared)
+    return found
+
+
+Boxes = Callable[[Site, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
+"""Fractions [M] of a segment in the boxes of each material, and the integrals [M] of the place over them."""
+
+
+def _all_boxes(site: Site, a: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
+    one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
+    # Matrix product: a masked sum would dominate the cost.
+    share, moment = _box_fractions(site.obstacles, a, direction)
+    stacked = jnp.stack([share, jax.lax.stop_gradient(moment)])
+    fractions, moments = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
+    return fractions, moments
+
+
+def _box_after_box(site: Site, a: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+    boxes, materials = site.obstacles, jnp.arange(len(site.material_names), dtype=jnp.int32)
+
+    def add(k: jax.Array, found: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        box = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 1), boxes)
+        share, moment = _box_fractions(box, a, direction)
+        own = box.material == materials
+        return found[0] + jnp.where(own, share, 0.0), found[1] + jnp.where(own, moment, 0.0)
+
+    nothing = jnp.zeros(materials.shape)
+    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, (nothing, nothing))
 
 
 def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
