@@ -140,7 +140,7 @@ class Localisation(Model):
 
     A source is one where twice the logarithm of the likelihood ratio exceeds the square of ``detection_sigma``. Sources
     are looked for at points ``grid_m`` apart, then within ``search_radius_m`` of the best of them, then in
-    ``search_rounds`` rounds, each within two fifths of the one before. The posterior of each is that of at most
+    ``search_rounds`` rounds, each half as far as the one before. The posterior of each is that of at most
     ``sample_rounds`` times ``samples`` places. ``rays_per_window`` lead to each window along its way, which walls'
     shadows may cross.
     """
@@ -153,7 +153,7 @@ class Localisation(Model):
     detection_sigma: float = Field(default=5.5, ge=1, le=100)
     grid_m: float = Field(default=4.0, ge=0.1, le=1000)
     search_radius_m: float = Field(default=6.0, ge=0.01, le=1000)
-    search_rounds: int = Field(default=4, ge=1, le=100)
+    search_rounds: int = Field(default=7, ge=1, le=100)
     sample_rounds: int = Field(default=12, ge=1, le=100)
     samples: int = Field(default=40, ge=16, le=10_000)
 
@@ -165,8 +165,9 @@ class Knowledge(Model):
     all of a material, and standing within ``geometry_std_m`` of where they are presumed; ``terrain``, without anything
     that stands on it; ``none``, a plane. Measured places are off by ``pose_std_m`` for each vehicle (RTK), the
     sensitivity of a detector model by ``sensitivity_std``. ``nuclides`` are those in question. ``background_std`` is
-    how much a background may differ from one window to the next, and ``model_std`` what is presumed of errors of the
-    model of the rates, both as standard deviations of logarithms.
+    how much a background may differ from one window to the next, ``model_std`` what is presumed of errors of the model
+    of the rates in a window, and ``spectrum_std`` of each region of its spectrum beside that, all as standard
+    deviations of logarithms.
     """
 
     site: Literal["exact", "geometry", "terrain", "none"] = "geometry"
@@ -176,6 +177,7 @@ class Knowledge(Model):
     sensitivity_std: float = Field(default=0.03, ge=0, le=0.5)
     background_std: float = Field(default=0.3, ge=0.01, le=1)
     model_std: float = Field(default=0.05, ge=0.001, le=1)
+    spectrum_std: float = Field(default=0.02, ge=0, le=1)
     nuclides: Literal["unknown"] | Annotated[tuple[Name, ...], Field(min_length=1, max_length=100)] = "unknown"
 
 

@@ -171,7 +171,7 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
     """The normal equations at ``u``, where ``model`` is linearised."""
     m = problem.measurements
     assert m.rois is not None
-    weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
+    weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
     left = weight * (m.rois - model.mean)
     common_precision, own_precision = prior_precision(problem, u.others.shape[0]), model.precision
     nuisance = window_unknowns(u)
@@ -225,7 +225,9 @@ def log_likelihood(problem: Problem, model: Linearised) -> jax.Array:
     """Log likelihood [] of the counts, relative to the saturated model."""
     m = problem.measurements
     assert m.rois is not None
-    return poisson_log_likelihood(m.rois, jnp.maximum(model.mean, MEAN_FLOOR), m.valid[:, None])
+    # it grows with the counts: a tenth of all of them are worth a tenth of it
+    trusted, mean = problem.trust * m.rois, problem.trust * jnp.maximum(model.mean, MEAN_FLOOR)
+    return poisson_log_likelihood(trusted, mean, m.valid[:, None])
 
 
 def window_unknowns(u: Unknowns) -> jax.Array:
@@ -310,7 +312,7 @@ def _first_activity(problem: Problem, source: Rates, others: Others, u: Unknowns
     model = linearised(problem, silent(problem), others, jnp.zeros(3), replace(u, activity_bq=jnp.zeros(())))
     # a background that varies is part of the variance, as if it did so in each region by itself
     variance = model.mean + jnp.square(problem.background_std * model.mean)
-    weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(variance, MEAN_FLOOR), 0.0)
+    weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(variance, MEAN_FLOOR), 0.0)
     score, information = jnp.sum(weight * net * (m.rois - model.mean)), jnp.sum(weight * net * net)
     least = 10.0 / jnp.maximum(jnp.sum(jnp.where(m.valid[:, None], net, 0.0)), 1e-30)
     return jnp.maximum(score / jnp.maximum(information, 1e-30), least)

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from swarmsim.device import either
 from swarmsim.estimation.likelihood import position_of, travel_gain
 from swarmsim.estimation.measurements import Measurements
 from swarmsim.pytree import pytree, static
@@ -44,6 +45,7 @@ class Problem:
     background_std: jax.Array  # [] of a window's ln(background over the detector's level)
     model_std: jax.Array  # [] of a window's ln(true over modelled rate of the sources)
     pose_std_m: jax.Array  # [n] of a window's place
+    trust: jax.Array  # [n, R] 0..1: the counts of a region in a window are worth so many times as many (`trust_of`)
     height_m: jax.Array  # [] prior of a source's height above ground
     height_std_m: jax.Array  # []
     nodes: tuple[Nodes, ...]  # of each span
@@ -100,14 +102,9 @@ def ways_from(problem: Problem, place: jax.Array) -> Ways:
     for span, nodes in zip(problem.spans, problem.nodes, strict=True):
         ends = nodes.position_m
         zero = jnp.zeros((ends.shape[0], materials))
+        nothing = Crossed(length_m=zero, place=zero)
         used = jnp.any(problem.measurements.valid[span[0] : span[1]])
-        found.append(
-            jax.lax.cond(
-                used,
-                lambda ends=ends: crossed_from(problem.site, position, ends),
-                lambda zero=zero: Crossed(length_m=zero, place=zero),
-            )
-        )
+        found.append(either(used, partial(crossed_from, problem.site, position, ends), partial(lambda x: x, nothing)))
     return Ways(crossed=tuple(found), position_m=position)
 
 
@@ -130,7 +127,7 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) 
             return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen))
 
         used = jnp.any(problem.measurements.valid[span[0] : span[1]])
-        parts.append(jax.lax.cond(used, seen, nothing))
+        parts.append(either(used, seen, nothing))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
@@ -174,6 +171,16 @@ def dead_time(problem: Problem, counts: jax.Array) -> tuple[jax.Array, jax.Array
         shares.append(share)
         slopes.append(slope)
     return jnp.concatenate(shares), jnp.concatenate(slopes)
+
+
+def trust_of(counts: jax.Array, background: jax.Array, std: jax.Array) -> jax.Array:
+    """Share [n, R] of the information in ``counts`` [n, R] that is left where the model's spectrum is off by ``std``.
+
+    The variance mean + (std signal)^2 of an error of each region's signal over the mean, with the signal as it is
+    counted above the ``background`` [n, R] expected: the same at every place, so that likelihoods can be compared.
+    """
+    signal = jnp.maximum(counts - background, 0.0)
+    return 1.0 / (1.0 + jnp.square(std * signal) / jnp.maximum(counts, 1.0))
 
 
 def lengthened(source: Rates, change: jax.Array) -> Rates:

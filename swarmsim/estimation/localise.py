@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
-from swarmsim.estimation.forward import Problem, Span, nodes_of, padded
+from swarmsim.estimation.forward import Problem, Span, nodes_of, padded, trust_of
 from swarmsim.estimation.likelihood import natural_background, position_covariance
 from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.posterior import Posterior, posteriors
@@ -42,6 +42,7 @@ class Presumed:
     material_std: jax.Array  # [U] of ln(true over presumed length) in each uncertain material
     background_std: jax.Array  # [] of a window's ln(background over the level)
     model_std: jax.Array  # [] of a window's ln(true over modelled rate)
+    spectrum_std: jax.Array  # [] of ln(true over modelled rate) of a region beside that
     pose_std_m: jax.Array  # [] of measured places
     place_std_m: jax.Array  # [] error of a source's place that all windows have in common: of poses and walls
     sensitivity_std: jax.Array  # [] of ln(true over presumed sensitivity) of a detector
@@ -149,6 +150,7 @@ def presume(
         material_std=on_host([std] * len(uncertain)),
         background_std=on_host(knowledge.background_std),
         model_std=on_host(model),
+        spectrum_std=on_host(knowledge.spectrum_std),
         pose_std_m=on_host(knowledge.pose_std_m),
         place_std_m=on_host(np.hypot(knowledge.pose_std_m, 0.0 if exact else knowledge.geometry_std_m)),
         sensitivity_std=on_host(knowledge.sensitivity_std),
@@ -207,11 +209,13 @@ def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span
         ]
     )
     travel = jnp.sum(jnp.square(m.travel_m), axis=-1)
+    background = nominal * (natural * m.exposure_s)[:, None]
     return Problem(
         site=presumed.site,
         detectors=presumed.detectors,
         measurements=m,
-        background=nominal * (natural * m.exposure_s)[:, None],
+        background=background,
+        trust=trust_of(m.rois, background, jnp.asarray(presumed.spectrum_std)),
         material_std=jnp.asarray(presumed.material_std),
         background_std=jnp.asarray(presumed.background_std),
         model_std=jnp.asarray(presumed.model_std),

@@ -18,7 +18,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import each
+from swarmsim.device import each, either
 from swarmsim.estimation.fit import MEAN_FLOOR, alone, normal_equations, settle
 from swarmsim.estimation.forward import Problem, ways_from
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
@@ -252,7 +252,7 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> t
     def one(k: jax.Array) -> Posterior:
         zero = jnp.zeros(())
         nothing = Posterior(mean=jnp.zeros(4), covariance=jnp.eye(4), effective=zero, halves=zero)
-        return jax.lax.cond(s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing)
+        return either(s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing)
 
     return jax.lax.map(one, jnp.arange(s.present.shape[0])), goodness(problem, state)
 
@@ -287,7 +287,7 @@ def goodness(problem: Problem, state: State) -> Goodness:
     mean = jnp.maximum(model.mean, MEAN_FLOOR)
     cells = m.valid[:, None] & (problem.background > 0.0)
     return Goodness(
-        chi_squared=jnp.sum(jnp.where(cells, jnp.square(m.rois - model.mean) / mean, 0.0)),
+        chi_squared=jnp.sum(jnp.where(cells, problem.trust * jnp.square(m.rois - model.mean) / mean, 0.0)),
         freedom=jnp.maximum(jnp.sum(cells) - at.fitted - 4.0 * jnp.sum(state.sources.present), 1.0),
         spread=jnp.sqrt(jnp.sum(jnp.where(cells, 2.0 + 1.0 / mean, 0.0))),
     )

@@ -57,7 +57,7 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     assert m.rois is not None
     model = linearised(problem, silent(problem), others, jnp.zeros(3), u)
     at = normal_equations(problem, model, u)
-    weight = jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, 1e-3), 0.0)
+    weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, 1e-3), 0.0)
     names, models = problem.detectors[0].material_names, detector_of(problem)
     air = names.index("air") if "air" in names else 0
     kernels = [padded(open_rates(d, allowed.shape[0], air), regions) for d in problem.detectors]

@@ -82,7 +82,7 @@ def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array,
     rest = linearised(problem, source, others, where, replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(())))
     return Screen(
         left=jnp.where(m.valid[:, None], m.rois - rest.mean, 0.0),
-        weight=jnp.where(m.valid[:, None], 1.0 / jnp.maximum(model.mean, MEAN_FLOOR), 0.0),
+        weight=jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, MEAN_FLOOR), 0.0),
         own=model.own,
         inverse=normal_equations(problem, model, u).own,
         registered=model.registered,

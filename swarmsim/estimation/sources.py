@@ -11,6 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
+from swarmsim.device import either, switch
 from swarmsim.estimation.fit import Others, Settled, Unknowns, nothing_known, without_more
 from swarmsim.estimation.forward import Problem, Rates, rates, variance_of, ways_from
 from swarmsim.estimation.likelihood import position_of
@@ -24,10 +25,12 @@ STARTS = 8  # grid points that are tried for a further source
 BEGINNINGS = STARTS // FITTED  # rounds that try them
 AROUND = 1.5  # how far around a grid point, over the distance from one to the next
 REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; nuclides are compared in the second
-CLOSING = 0.4  # reach of a later round over that of the one before
+CLOSING = 0.55  # reach of a later round over that of the one before
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
 HOPELESS = 0.4  # of the threshold: the ratio at the best of the starts below which no further round is worth while
 APART_M = 12.0  # between starts
+TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
+MOST_TOLERANT = 0.5
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 
@@ -105,7 +108,7 @@ def signals(problem: Problem, s: Sources, lengths: jax.Array) -> Others:
             found = rates(problem, ways, nuclide, lengths)
             return Others(counts=activity * found.counts, variance=variance_of(problem, ways.position_m) + found.edge)
 
-        return jax.lax.cond(there, seen, lambda: Others(counts=jnp.zeros((n, regions)), variance=jnp.zeros(n)))
+        return either(there, seen, lambda: Others(counts=jnp.zeros((n, regions)), variance=jnp.zeros(n)))
 
     return jax.lax.map(one, (s.place, s.nuclide, s.activity_bq, s.present))
 
@@ -180,7 +183,7 @@ def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.
         less = replace(less, trial=ratio[k] >= params.threshold, again=less.state.sources.present)
         return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * params.threshold), less, p)
 
-    return jax.lax.cond(now, begin, lambda: p)
+    return either(now, begin, lambda: p)
 
 
 def _ended_trial(params: SearchParams, p: _Progress, now: jax.Array) -> _Progress:
@@ -210,7 +213,7 @@ def _sought(
         return Starts(point_m=points_m[index], nuclide=scanned.nuclide[index]), statistic[0]
 
     nothing = Starts(point_m=jnp.zeros((STARTS, 3)), nuclide=jnp.zeros(STARTS, jnp.int32))
-    starts, statistic = jax.lax.cond(adding, first_look, lambda: (nothing, jnp.zeros(())))
+    starts, statistic = either(adding, first_look, lambda: (nothing, jnp.zeros(())))
 
     def look() -> tuple[State, jax.Array]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
@@ -223,7 +226,7 @@ def _sought(
         return jax.tree.map(partial(jnp.where, found), after, state), found
 
     worth = ~adding | (statistic > PROMISING * params.threshold)
-    return jax.lax.cond(worth, look, lambda: (state, jnp.array(False)))
+    return either(worth, look, lambda: (state, jnp.array(False)))
 
 
 def _best(
@@ -241,7 +244,7 @@ def _best(
     known = allowed.shape[0]
     size = FITTED * max(PART, -(-known // FITTED))
     closing = CLOSING ** jnp.arange(1, params.rounds + 1)
-    reaches = params.reach_m * jnp.concatenate([jnp.zeros(BEGINNINGS), jnp.array(REACHES), closing])
+    reaches = params.reach_m * jnp.concatenate([jnp.ones(BEGINNINGS), jnp.array(REACHES), closing])
     naming, closer = BEGINNINGS + 1, BEGINNINGS + len(REACHES)
     first = jnp.where(adding, 0, jnp.where(wide, BEGINNINGS, closer))
     yes, no = jnp.ones(size, bool), jnp.zeros(size, bool)
@@ -265,8 +268,8 @@ def _best(
     def around(best: Tried, number: jax.Array) -> Candidates:
         reach_m = reaches[number]
         places = spread(best.place, reach_m, jnp.minimum(reach_m, up_m), size, number.astype(jnp.float32))
-        # the place of a source that is sought again is the first candidate
-        sure = (jnp.arange(size) == 0) & (number == first)
+        # the best place so far is the first candidate: the tolerance is another now
+        sure = jnp.arange(size) == 0
         places = jnp.where(sure[:, None], best.place, places)
         return Candidates(
             place=places, nuclide=jnp.full(size, best.nuclide), counts=yes, sure=sure, apart=yes[0]
@@ -276,11 +279,16 @@ def _best(
         number, best, table = carry
         named = (number == naming) & (adding | wide)
         kind = jnp.where(number < BEGINNINGS, 0, jnp.where(named, 1, 2))
-        candidates = jax.lax.switch(kind, [begin, name, around], best, number)
+        candidates = switch(kind, [partial(kind_, best, number) for kind_ in (begin, name, around)])
         u = best.fit.unknowns
-        screen = screen_of(problem, others, best.fit.rates, position_of(problem.site, best.place), u)
-        before = replace(best, fit=replace(best.fit, value=jnp.where(named, -jnp.inf, best.fit.value)))
-        best, values = best_of(problem, others, u, screen, candidates, before)
+        tolerance = jnp.clip(
+            TOLERANT * reaches[number], problem.model_std, jnp.maximum(problem.model_std, MOST_TOLERANT)
+        )
+        tolerant = replace(problem, model_std=tolerance)
+        screen = screen_of(tolerant, others, best.fit.rates, position_of(problem.site, best.place), u)
+        anew = number >= BEGINNINGS
+        before = replace(best, fit=replace(best.fit, value=jnp.where(anew, -jnp.inf, best.fit.value)))
+        best, values = best_of(tolerant, others, u, screen, candidates, before)
         return number + 1, best, jnp.where(named, values[:known], table)
 
     def on(carry: tuple[jax.Array, Tried, jax.Array]) -> jax.Array:
@@ -366,6 +374,6 @@ def ratios(problem: Problem, state: State) -> jax.Array:
             rest = without(state, k).added
             return 2.0 * (state.likelihood - without_more(problem, rest, state.unknowns, ALONE_STEPS)[1])
 
-        return jax.lax.cond(state.sources.present[k], look, lambda: jnp.zeros(()))
+        return either(state.sources.present[k], look, lambda: jnp.zeros(()))
 
     return jax.lax.map(one, jnp.arange(state.sources.present.shape[0]))

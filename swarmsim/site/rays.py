@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
@@ -93,18 +94,18 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
 
     ``platform`` is that of `swarmsim.scalars.over_vehicles`.
     """
-    above, boxes = above_of(site), site.obstacles
-    shared = (boxes, site.terrain_m, above.highest_m, site.origin_m, site.cell_m, site.ground_material)
+    above = above_of(site)
+    needed = (site.obstacles, site.terrain_m, site.origin_m, site.cell_m, site.ground_material)
+    nothing, shapes = np.zeros(1, np.float32), above.shapes
+    bare = jax.tree.map(lambda _: nothing, site)
 
-    def one(end: jax.Array, start: jax.Array, shared: Any) -> Crossed:
-        boxes, terrain, highest, origin, cell, ground = shared
-        here = replace(
-            site, obstacles=boxes, terrain_m=terrain, origin_m=origin, cell_m=cell, ground_material=ground
-        )  # fmt: skip
-        return _crossed(here, replace(above, highest_m=highest), start, end, _box_after_box)
+    def one(end: jax.Array, start: jax.Array, needed: Any, highest: jax.Array) -> Crossed:
+        boxes, terrain, origin, cell, ground = needed
+        here = replace(bare, obstacles=boxes, terrain_m=terrain, origin_m=origin, cell_m=cell, ground_material=ground)
+        return _crossed(here, Ceilings(highest_m=highest, shapes=shapes), start, end, _box_after_box)
 
     starts = jnp.broadcast_to(a, b.shape)
-    found: Crossed = over_vehicles(one, (0, 0, None), platform=platform)(b, starts, shared)
+    found: Crossed = over_vehicles(one, (0, 0, None, None), platform=platform)(b, starts, needed, above.highest_m)
     return found
 
 

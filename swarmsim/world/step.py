@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim import randomness
+from swarmsim.device import either
 from swarmsim.physics.wind import GUST_DRAWS, gust_noise, gust_scales, gust_start
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
@@ -212,17 +213,6 @@ def _go(
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
     after, places = go(group.params, group.limits, seen, collided, command)
     return counted(world, group, state.key, first, periods, running, before, after, places, branch=either)
-
-
-def either(predicate: jax.Array, one: Callable[[], Any], other: Callable[[], Any]) -> Any:
-    """The result of ``one`` where ``predicate`` [] holds, else that of ``other``.
-
-    A condition that each mission has of its own makes `jax.vmap` compute both anyway, and `jax.lax.cond` copy all that
-    they read, rasters of the site as well, for every mission. On a GPU, which steps many, both are computed at once.
-    """
-    if not _in_kernels():
-        return jax.lax.cond(predicate, one, other)
-    return jax.tree.map(lambda a, b: a if a is b else jnp.where(predicate, a, b), one(), other())
 
 
 def _in_kernels() -> bool:
