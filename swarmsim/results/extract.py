@@ -345,6 +345,7 @@ def _verdict(
         fit,
         aerial,
         final,
+        float(simulation.plan.presumed.background_std) if simulation.plan.presumed is not None else 0.0,
     )
 
 

@@ -27,6 +27,7 @@ MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts th
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
+UNEXPLAINED_SIGMA = 3.0  # of the background: a hotspot that exceeds it by less may be of the background
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,7 @@ def assess(
     fit: Fit,
     aerial: Sequence[Estimate],
     final: Sequence[Estimate],
+    background_std: float,
 ) -> Verdict:
     """Judge an answer.
 
@@ -65,6 +67,7 @@ def assess(
         fit: of all sources to all counts.
         aerial: sources by the survey's counts.
         final: sources by all counts, the surest first.
+        background_std: how much a background may differ from place to place, of its logarithm.
     """
     covered = coverage(samples, chart, ground_m)
     reasons = []
@@ -75,7 +78,7 @@ def assess(
     if covered < COVERED_SHARE:
         status = "incomplete_survey" if status in ("none", "located") else status
         reasons.append(f"only {covered:.0%} of the survey area was measured")
-    doubts = _doubts(chart, fit, aerial, final)
+    doubts = _doubts(chart, fit, aerial, final, background_std)
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     reasons += [sentence for _, sentence in doubts]
@@ -111,7 +114,7 @@ def _saturated(samples: Samples, limits_cps: tuple[Floats, Floats]) -> bool:
 
 
 def _doubts(
-    chart: RadiationMap, fit: Fit, aerial: Sequence[Estimate], final: Sequence[Estimate]
+    chart: RadiationMap, fit: Fit, aerial: Sequence[Estimate], final: Sequence[Estimate], background_std: float
 ) -> list[tuple[Status, str]]:
     """Reasons not to believe the answer, the gravest first."""
     found: list[tuple[Status, str]] = []
@@ -134,13 +137,19 @@ def _doubts(
         std = np.sqrt(np.maximum(np.linalg.eigvalsh(np.asarray(one.covariance_m2)[:2, :2])[-1], 0.0))
         if std > FAR_STD_M:
             found.append(("detected", f"the place of the {one.nuclide} source is known to {std:.0f} m only"))
-    found += _unexplained(chart, final)
+    found += _unexplained(chart, final, background_std)
     return found
 
 
-def _unexplained(chart: RadiationMap, final: Sequence[Estimate]) -> list[tuple[Status, str]]:
-    """Hotspots of the map that no source found explains."""
+def _unexplained(chart: RadiationMap, final: Sequence[Estimate], background_std: float) -> list[tuple[Status, str]]:
+    """Hotspots of the map that no source found explains, nor a background that differs from place to place.
+
+    Whether a fainter one is a source is what the estimate decides, by its spectrum.
+    """
     hotspots = np.asarray(chart.hotspots_m, float).reshape(-1, 2)
+    column, row = np.rint((hotspots - chart.origin_m) / chart.cell_m).astype(int).T
+    rates = chart.mean_cps[row, column]
+    hotspots = hotspots[rates > np.median(chart.mean_cps) * (1.0 + UNEXPLAINED_SIGMA * background_std)]
     places = np.array([np.asarray(one.position_m, float)[:2] for one in final]).reshape(-1, 2)
     away = np.linalg.norm(hotspots[:, None] - places, axis=2).min(axis=1, initial=np.inf) > UNEXPLAINED_M
     if not np.any(away) or not len(places):

@@ -150,8 +150,9 @@ def test_ground_data_sharpen_the_aerial_estimate(localiser):
     both, aerial = localiser(m).fits, localiser(replace(m, valid=AERIAL.valid)).fits
     assert float(both.covariance_m2[0, 0, 0]) < 0.05 * float(aerial.covariance_m2[0, 0, 0])
     np.testing.assert_allclose(both.position_m[0, :2], SOURCE[:2], atol=0.02)
-    # nothing but the ground, which no source lies below, tells its height: the mean lies 0.2 m above the truth
-    np.testing.assert_allclose(both.position_m[0, 2], SOURCE[2], atol=1.0 * sigma(both)[2])
+    # little but the ground, which no source lies below, tells its height: the mean lies 0.2 m above the truth, and 128
+    # places tell it within another 0.2 m
+    np.testing.assert_allclose(both.position_m[0, 2], SOURCE[2], atol=0.5)
     np.testing.assert_allclose(both.activity_bq[0], ACTIVITY, rtol=0.01)
 
 

@@ -22,11 +22,11 @@ pytestmark = pytest.mark.optimised
 SEEDS = 32
 # Fewer rounds and places than a mission takes: the bound is asked for within 30 %, and there are many fits.
 QUICK = (
-    "localisation.search_rounds=3",
+    "localisation.search_rounds=5",
     "localisation.sample_rounds=4",
     "localisation.samples=32",
     "localisation.sources_max=1",
-    "knowledge={site: exact, pose_std_m: 0.0, sensitivity_std: 0.0, model_std: 0.01, nuclides: [Co-60]}",
+    "knowledge={site: exact, pose_std_m: 0.0, sensitivity_std: 0.0, model_std: 0.01, spectrum_std: 0.0, nuclides: [Co-60]}",
 )
 
 

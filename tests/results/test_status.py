@@ -13,8 +13,10 @@ GOOD = Fit(misfit=0.3, chi_squared=1.01)
 SIDE_M, HEIGHT_M = 60.0, 20.0
 
 
-def chart(hotspots=((0.0, 0.0),)) -> RadiationMap:
-    cells = np.zeros((31, 31))
+def chart(hotspots=((0.0, 0.0),), rate=400.0) -> RadiationMap:
+    cells = np.full((31, 31), 94.0)
+    for x, y in hotspots:
+        cells[round((y + 30.0) / 2.0), round((x + 30.0) / 2.0)] = rate
     return RadiationMap(np.array([-30.0, -30.0]), 2.0, cells, cells + 1.0, np.array(hotspots, float).reshape(-1, 2))
 
 
@@ -35,13 +37,15 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
     return Estimate(np.array([x, 0.0, 1.0]), covariance, activity, 0.05 * activity, 1.0, nuclide)
 
 
-def verdict(samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3):
+def verdict(
+    samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0
+):
     samples = survey() if samples is None else samples
     n = len(samples.counts)
     limits = (np.full(n, highest), np.full(n, 94.0))
     return assess(
-        samples, chart(hotspots), limits, np.zeros(n), fit,
-        (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (),
+        samples, chart(hotspots, rate), limits, np.zeros(n), fit,
+        (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
     )  # fmt: skip
 
 
@@ -82,6 +86,12 @@ def test_a_source_that_the_survey_did_not_show_is_compared_with_none() -> None:
 def test_a_hotspot_that_a_further_source_explains_is_no_doubt() -> None:
     two = (estimate(), estimate(-27.0, nuclide="Cs-137"))
     assert verdict(final=two, hotspots=((0.0, 0.0), (-28.0, 0.0))).status == "located"
+
+
+def test_a_faint_hotspot_may_be_of_the_background() -> None:
+    far = ((0.0, 0.0), (-28.0, 0.0))
+    assert verdict(hotspots=far, rate=94.0 * 1.8).status == "located"
+    assert verdict(hotspots=far, rate=94.0 * 2.0).status == "ambiguous"
 
 
 def test_the_gravest_doubt_decides_and_all_are_told() -> None:
