@@ -26,7 +26,8 @@ QUICK = (
     "localisation.sample_rounds=4",
     "localisation.samples=32",
     "localisation.sources_max=1",
-    "knowledge={site: exact, pose_std_m: 0.0, sensitivity_std: 0.0, model_std: 0.01, spectrum_std: 0.0, nuclides: [Co-60]}",
+    "knowledge={site: exact, pose_std_m: 0.0, sensitivity_std: 0.0, model_std: 0.01, spectrum_std: 0.0,"
+    " nuclides: [Co-60]}",
 )
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from yards import MATERIALS, make_site
 
 from swarmsim.site import path_lengths
+from swarmsim.site.rays import by_threads, crossed_from
 
 lengths_of = jax.jit(path_lengths)
 gradients = jax.jit(
@@ -161,3 +162,19 @@ def test_gradient_equals_difference():
         for e in jnp.eye(3)
     ]
     np.testing.assert_allclose(gradient, difference, atol=2e-3)
+
+
+def test_a_thread_for_each_segment_crosses_the_same():
+    """The way of an accelerator, evaluated without one, for several beginnings at once."""
+    rng = np.random.default_rng(2)
+    site = make_site([
+        ((*rng.uniform(-8.0, 8.0, 2), 1.0), (*rng.uniform(0.3, 3.0, 2), 1.5), rng.uniform(0.0, 3.0), wall, "concrete")
+        for wall in (0.0, 0.1, 0.0, 0.2, 0.0)
+    ])  # fmt: skip
+    starts = jnp.asarray(np.c_[rng.uniform(-12.0, 12.0, (3, 2)), rng.uniform(0.3, 2.0, 3)], jnp.float32)
+    ends = jnp.asarray(np.c_[rng.uniform(-12.0, 12.0, (40, 2)), rng.uniform(0.3, 15.0, 40)], jnp.float32)
+    expected = jax.jit(jax.vmap(lambda a: crossed_from(site, a, ends)))(starts)
+    found = jax.jit(jax.vmap(lambda a: by_threads(site, a, ends, "gpu, interpreted")))(starts)
+    np.testing.assert_allclose(found.length_m, expected.length_m, atol=1e-4)
+    np.testing.assert_allclose(found.place, expected.place, atol=1e-4)
+    assert float(expected.length_m.max()) > 5.0
