@@ -67,8 +67,8 @@ def net_rates(
 
     The mean over the way of the crystal during the measurement, by a ray to the middle of each of ``rays`` equal parts
     of it: within each, 1/r² is integrated in closed form and the rest taken as constant. Rows that are not valid have
-    some rate or zero. Order rows as `in_blocks` does: only the rays of valid rows cost time, and each only for its own
-    detector (except under `vmap`, where a `cond` evaluates both branches).
+    some rate or zero. Order rows by detector, the invalid ones last: only the rays of valid rows cost time, and each
+    only for its own detector (except under `vmap`, where a `cond` evaluates both branches).
     """
     source = Source(position_m=position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
     middle = (jnp.arange(rays) + 0.5) / rays - 0.5
@@ -97,14 +97,6 @@ def net_rates(
     padded = jax.tree.map(lambda x: jnp.pad(x, [(0, -n % size)] + [(0, 0)] * (x.ndim - 1)), m)
     blocks = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), padded)
     return jax.lax.map(of_valid, blocks).reshape(-1)[:n]
-
-
-def in_blocks(m: Measurements) -> jax.Array:
-    """The order [n] in which `net_rates` is cheapest: detector by detector, from the ground up, the invalid ones last.
-
-    Windows near the ground stand next to one another, because only their rays need to be followed through the terrain.
-    """
-    return jnp.lexsort((m.position_m[:, 2], m.detector, ~m.valid))
 
 
 def exact_rates(problem: FitProblem, position_m: jax.Array) -> jax.Array:

@@ -44,7 +44,6 @@ class Conclusion:
     survey: Survey  # what sent the searchers out, or the map and estimate of all counts
     spectrum: Accumulated | None  # None without an identification
     identification: Identification | None
-    named: jax.Array  # [] bool: the identification gave the first source its nuclide
     estimated: Estimated  # from all counts
 
 
@@ -99,7 +98,7 @@ def conclude(
     assert plan.localisation is not None
     assert plan.presumed is not None
     state = known.estimated.state
-    spectrum, identification, named = None, None, jnp.array(False)
+    spectrum, identification = None, None
     if plan.spectrometer >= 0:
         spectrum = _spectrum(key, world, plan, known, measurements)
         identification = identify(plan.detectors[plan.spectrometer], spectrum.counts, spectrum.live_s)
@@ -109,7 +108,7 @@ def conclude(
         first = jnp.where(named & state.sources.present[0], identification.nuclide, nuclides[0])
         state = replace(state, sources=replace(state.sources, nuclide=nuclides.at[0].set(first)))
     estimated = localise(plan.presumed, measurements, spans, plan.localisation, state)
-    return Conclusion(survey=known, spectrum=spectrum, identification=identification, named=named, estimated=estimated)
+    return Conclusion(survey=known, spectrum=spectrum, identification=identification, estimated=estimated)
 
 
 def _spectrum(key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements) -> Accumulated:

@@ -79,7 +79,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         sources=true_sources(simulation, batch.worlds.of(index)),
         paths_m=_paths(simulation, end),
         events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
-        finding=_finding(verdict, final, spectrum, _no_way(simulation, end)),
+        finding=_finding(verdict, final, spectrum, _no_way(simulation, end), _one_nuclide(simulation)),
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
         warnings=(CROWDED,) if bool(end.world.crowded) else (),
@@ -349,20 +349,31 @@ def _verdict(
     )
 
 
-def _finding(verdict: Verdict | None, final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool) -> str:
-    """What was found, and why it is not to be believed where it is not."""
+def _one_nuclide(simulation: Simulation) -> bool:
+    presumed = simulation.plan.presumed
+    return presumed is not None and int(np.sum(np.asarray(presumed.nuclides))) == 1
+
+
+def _finding(
+    verdict: Verdict | None, final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, presumed: bool
+) -> str:
+    """What was found, and why it is not to be believed where it is not.
+
+    ``presumed``: one nuclide alone is in question.
+    """
+    by = "nuclide presumed" if presumed else "nuclide by the counts"
     if verdict is None:
         return NOTHING_SOUGHT
-    found = _found(final, spectrum, no_way)
+    found = _found(final, spectrum, no_way, by)
     if not verdict.reasons:
         return found
     return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
 
 
-def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool) -> str:
+def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, by: str) -> str:
     if not final:
         return NOTHING_FOUND
-    first = _surest(final[0], spectrum, no_way)
+    first = _surest(final[0], spectrum, no_way, by)
     if len(final) == 1:
         return f"a source of {first}"
     others = "; ".join(f"of {_placed(one)}" for one in final[1:])
@@ -374,26 +385,24 @@ def _placed(estimate: Estimate) -> str:
     return f"{estimate.activity_mbq:.0f} MBq {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
 
 
-def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool) -> str:
+def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str) -> str:
     place = _placed(estimate)
     if no_way:
-        return f"{place}; nuclide by the survey's counts, no drivable way for the rover to reach it"
+        return f"{place}; {by}, no drivable way for the rover to reach it"
     if spectrum is None:
-        return f"{place}; nuclide by the survey's counts, no spectrum was taken near it"
-    return f"{place}; {_identified(estimate, spectrum)}"
+        return f"{place}; {by}, no spectrum was taken near it"
+    return f"{place}; {_identified(estimate, spectrum, by)}"
 
 
-def _identified(estimate: Estimate, spectrum: Spectrum) -> str:
+def _identified(estimate: Estimate, spectrum: Spectrum, by: str) -> str:
     """What the spectrum says of the nuclide under which the source was estimated."""
     if spectrum.nuclide == "none":
-        return "nuclide by the survey's counts, the spectrum shows none"
+        return f"{by}, the spectrum shows none"
     if spectrum.nuclide == "unknown":
-        return f"nuclide by the survey's counts, the spectrum is of none in the library with {spectrum.confidence:.0%}"
+        return f"{by}, the spectrum is of none in the library with {spectrum.confidence:.0%}"
     said = f"identified with {spectrum.confidence:.1%}"
     if spectrum.nuclide != estimate.nuclide:
-        said = (
-            f"nuclide by the survey's counts, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
-        )
+        said = f"{by}, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
     if spectrum.goodness < BAD_FIT:
         said += f", but fits the spectrum badly (p = {spectrum.goodness:.1g})"
     return said
