@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmsim import device
 from swarmsim.control.commands import go_to
 from swarmsim.world import step as stepping
 from swarmsim.world.state import mission_axes
@@ -95,6 +96,7 @@ def test_commands_held_for_a_judging_period_are_those_of_each_period(
     fields, begun, commands, flown, in_kernels, monkeypatch
 ):
     monkeypatch.setattr(stepping, "_in_kernels", lambda: in_kernels)
+    monkeypatch.setattr(device, "on_processor", lambda: not in_kernels)
     held = jax.jit(lambda field, state: step(field, state, commands, 5))
     state, fresh = begun[0], []
     for _ in range(TICKS // 5):
@@ -160,6 +162,7 @@ def largest(jaxpr, count):
 def test_a_batch_of_missions_copies_no_raster(monkeypatch, fields, begun, commands, in_kernels):
     """On a GPU. On a CPU the conditions stay, which copy what they read: the test would see it."""
     monkeypatch.setattr(stepping, "_in_kernels", lambda: in_kernels)
+    monkeypatch.setattr(device, "on_processor", lambda: not in_kernels)
     field = replace(fields[0], layout="scalars")
     every = jax.vmap(lambda state: step(field, state, commands)[0])
     program = jax.make_jaxpr(every)(stacked(begun)).jaxpr
