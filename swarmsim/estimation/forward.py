@@ -98,14 +98,18 @@ def shares_of(rays: int) -> jax.Array:
 def ways_from(problem: Problem, place: jax.Array) -> Ways:
     """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
     position, materials = position_of(problem.site, place), len(problem.site.material_names)
-    found = []
-    for span, nodes in zip(problem.spans, problem.nodes, strict=True):
-        ends = nodes.position_m
-        zero = jnp.zeros((ends.shape[0], materials))
-        nothing = Crossed(length_m=zero, place=zero)
+
+    def of_span(span: Span, nodes: Nodes) -> Crossed:
+        zero = jnp.zeros((nodes.position_m.shape[0], materials))
         used = jnp.any(problem.measurements.valid[span[0] : span[1]])
-        found.append(either(used, partial(crossed_from, problem.site, position, ends), partial(lambda x: x, nothing)))
-    return Ways(crossed=tuple(found), position_m=position)
+        return either(
+            used,
+            lambda: crossed_from(problem.site, position, nodes.position_m),
+            lambda: Crossed(length_m=zero, place=zero),
+        )
+
+    crossed = tuple(of_span(span, nodes) for span, nodes in zip(problem.spans, problem.nodes, strict=True))
+    return Ways(crossed=crossed, position_m=position)
 
 
 def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) -> Rates:
@@ -117,11 +121,11 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) 
     factors = jnp.ones(materials).at[jnp.array(problem.uncertain, jnp.int32)].set(jnp.exp(lengths))
     source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
     parts = []
-    for span, crossed in zip(problem.spans, ways.crossed, strict=True):
+    for span, nodes, crossed in zip(problem.spans, problem.nodes, ways.crossed, strict=True):
         way = Crossed(length_m=crossed.length_m * factors, place=crossed.place)
 
-        def seen(span: Span = span, way: Crossed = way) -> Rates:
-            return _rates_of_span(problem, span, source, way)
+        def seen(span: Span = span, nodes: Nodes = nodes, way: Crossed = way) -> Rates:
+            return _rates_of_span(problem, span, nodes, source, way)
 
         def nothing(seen: Any = seen) -> Any:
             return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen))
@@ -131,10 +135,9 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) 
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
-def _rates_of_span(problem: Problem, span: Span, source: Source, way: Crossed) -> Rates:
+def _rates_of_span(problem: Problem, span: Span, nodes: Nodes, source: Source, way: Crossed) -> Rates:
     first, last, number, rays = span
-    nodes, share = problem.nodes[problem.spans.index(span)], shares_of(rays)
-    position, axis = nodes.position_m, nodes.axis
+    share, position, axis = shares_of(rays), nodes.position_m, nodes.axis
     offset = position - source.position_m
     detector = problem.detectors[number]
     rate, slope = roi_rates_and_slopes(detector, source, way, position, axis, problem.uncertain)

@@ -28,7 +28,7 @@ LINES = 8  # of a nuclide, to which neighbours are put together
 WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
 BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known: half of it may be missing
 POINTS_MAX = 20_000  # of the grid of the first look
-ENOUGH_EFFECTIVE = 10.0  # weighted places must be worth this many
+CONVERGED_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
 UNSURE = 0.25  # standard deviation of a place whose posterior could not be sampled, over the reach of the search
 
@@ -258,7 +258,7 @@ def localise(
     return _report(presumed, problem, params, state)
 
 
-def _sampled(
+def sampled(
     presumed: Presumed, params: LocalisationParams, s: Sources, posterior: Posterior
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Whether each posterior [K] was sampled well enough; their means [K, 4] and covariances [K, 4, 4].
@@ -271,7 +271,7 @@ def _sampled(
     sound = jnp.isfinite(posterior.mean).all(axis=1) & jnp.isfinite(posterior.covariance).all(axis=(1, 2))
     mean = jnp.where(sound[:, None], posterior.mean, known)
     covariance = jnp.where(sound[:, None, None], posterior.covariance, wide)
-    converged = sound & (posterior.effective >= ENOUGH_EFFECTIVE) & (posterior.halves <= HALVES_AGREE)
+    converged = sound & (posterior.effective >= CONVERGED_EFFECTIVE) & (posterior.halves <= HALVES_AGREE)
     # too few places to tell their spread: it must not look small
     unsure = jnp.where(converged, 0.0, jnp.square(UNSURE * reach))
     return converged, mean, covariance + unsure[:, None, None] * jnp.diag(jnp.array([1.0, 1.0, 0.0, 0.0]))
@@ -281,7 +281,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
     site, s, m = presumed.site, state.sources, problem.measurements
     posterior, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
-    converged, mean, covariance = _sampled(presumed, params, s, posterior)
+    converged, mean, covariance = sampled(presumed, params, s, posterior)
     log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std)
     height = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(mean[:, :2])
     activity = jnp.exp(mean[:, 3])

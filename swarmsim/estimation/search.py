@@ -49,7 +49,7 @@ class Candidates:
 
     place: jax.Array  # [C, 3]
     nuclide: jax.Array  # [C] int32
-    counts: jax.Array  # [C] bool, whether it is one
+    allowed: jax.Array  # [C] bool, whether it is one
     sure: jax.Array  # [C] bool, to be fitted in any case; one of its part at most
     apart: jax.Array  # [] bool, whether the best of each part is fitted, or the best of all
 
@@ -129,7 +129,7 @@ def best_of(
     places, c = jnp.clip(candidates.place, low, high), candidates
     quick = with_one_ray(problem)
     seen = each(lambda x: screened(quick, screen, x[1], x[0]), (places, c.nuclide), TOGETHER)
-    rank = jnp.where(c.sure, jnp.inf, jnp.where(c.counts, seen, -jnp.inf))
+    rank = jnp.where(c.sure, jnp.inf, jnp.where(c.allowed, seen, -jnp.inf))
     parts = rank.reshape(FITTED, -1)
     of_parts = jnp.argmax(parts, axis=1) + jnp.arange(FITTED) * parts.shape[1]
     chosen = jnp.where(c.apart, of_parts, jax.lax.top_k(rank, FITTED)[1])
@@ -138,7 +138,7 @@ def best_of(
     )  # fmt: skip
     value = jnp.where(rank[chosen] > -jnp.inf, tried.fit.value, -jnp.inf)
     first = jnp.argmax(value)
-    values = jnp.where(c.counts, seen + (value - seen[chosen])[first], -jnp.inf).at[chosen].set(value)
+    values = jnp.where(c.allowed, seen + (value - seen[chosen])[first], -jnp.inf).at[chosen].set(value)
     better = value[first] > best.fit.value
     return jax.tree.map(lambda a, b: jnp.where(better, a[first], b), tried, best), values
 

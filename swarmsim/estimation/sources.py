@@ -255,15 +255,14 @@ def _best(
         centre = jnp.concatenate([starts.point_m[index, :2], jnp.broadcast_to(problem.height_m, (FITTED, 1))], axis=1)
         around = jax.vmap(lambda c: spread(c, AROUND * params.grid_m, up_m, size // FITTED, number))(centre)
         nuclides = jnp.repeat(starts.nuclide[index], size // FITTED)
-        return Candidates(place=around.reshape(-1, 3), nuclide=nuclides, counts=yes, sure=no, apart=yes[0])
+        return Candidates(place=around.reshape(-1, 3), nuclide=nuclides, allowed=yes, sure=no, apart=yes[0])
 
     def name(best: Tried, number: jax.Array) -> Candidates:
         everyone = jnp.arange(size, dtype=jnp.int32)
         places = jnp.broadcast_to(best.place, (size, 3))
-        counts = jnp.pad(allowed, (0, size - known))
-        return Candidates(
-            place=places, nuclide=jnp.minimum(everyone, known - 1), counts=counts, sure=no, apart=no[0]
-        )  # fmt: skip
+        asked = jnp.pad(allowed, (0, size - known))
+        kinds = jnp.minimum(everyone, known - 1)
+        return Candidates(place=places, nuclide=kinds, allowed=asked, sure=no, apart=no[0])
 
     def around(best: Tried, number: jax.Array) -> Candidates:
         reach_m = reaches[number]
@@ -272,7 +271,7 @@ def _best(
         sure = jnp.arange(size) == 0
         places = jnp.where(sure[:, None], best.place, places)
         return Candidates(
-            place=places, nuclide=jnp.full(size, best.nuclide), counts=yes, sure=sure, apart=yes[0]
+            place=places, nuclide=jnp.full(size, best.nuclide), allowed=yes, sure=sure, apart=yes[0]
         )  # fmt: skip
 
     def round_(carry: tuple[jax.Array, Tried, jax.Array]) -> tuple[jax.Array, Tried, jax.Array]:

@@ -10,6 +10,7 @@ from swarmsim.estimation import Estimated
 from swarmsim.missions.state import MissionState
 from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.radiation.rate import highest_rate
+from swarmsim.results.finding import finding
 from swarmsim.results.record import (
     Estimate,
     Event,
@@ -30,12 +31,8 @@ from swarmsim.world.model import World
 
 LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
 """Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
-NOTHING_SOUGHT = "nothing was sought"
-NOTHING_FOUND = "no source above background"
 UNNAMED = {NONE: "none", UNKNOWN: "unknown"}
 """What a spectrum is said to show where no nuclide is named."""
-BAD_FIT = 1e-3
-"""p-value below which the finding says that the named nuclide does not fit the spectrum."""
 SAMPLE = ("time_s", "position_m", "counts", "exposure_s")
 """Columns that samples have in common with readings."""
 CROWDED = "more vehicles were in one place than the neighbour search holds: a collision may have gone unnoticed"
@@ -79,7 +76,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         sources=true_sources(simulation, batch.worlds.of(index)),
         paths_m=_paths(simulation, end),
         events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
-        finding=_finding(verdict, final, spectrum, _no_way(simulation, end), _one_nuclide(simulation)),
+        finding=finding(verdict, final, spectrum, _no_way(simulation, end), _one_nuclide(simulation)),
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
         warnings=(CROWDED,) if bool(end.world.crowded) else (),
@@ -327,7 +324,8 @@ def _verdict(
     final: tuple[Estimate, ...],
 ) -> Verdict:
     """Status of the mission's answer."""
-    estimated, detectors = conclusion.estimated, simulation.plan.detectors
+    estimated, detectors, presumed = conclusion.estimated, simulation.plan.detectors, simulation.plan.presumed
+    assert presumed is not None
     used = np.full(len(simulation.scenario.members), -1)
     for group in simulation.world.groups:
         if group.counter is not None:
@@ -345,64 +343,10 @@ def _verdict(
         fit,
         aerial,
         final,
-        float(simulation.plan.presumed.background_std) if simulation.plan.presumed is not None else 0.0,
+        float(presumed.background_std),
     )
 
 
 def _one_nuclide(simulation: Simulation) -> bool:
     presumed = simulation.plan.presumed
     return presumed is not None and int(np.sum(np.asarray(presumed.nuclides))) == 1
-
-
-def _finding(
-    verdict: Verdict | None, final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, presumed: bool
-) -> str:
-    """What was found, and why it is not to be believed where it is not.
-
-    ``presumed``: one nuclide alone is in question.
-    """
-    by = "nuclide presumed" if presumed else "nuclide by the counts"
-    if verdict is None:
-        return NOTHING_SOUGHT
-    found = _found(final, spectrum, no_way, by)
-    if not verdict.reasons:
-        return found
-    return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
-
-
-def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, by: str) -> str:
-    if not final:
-        return NOTHING_FOUND
-    first = _surest(final[0], spectrum, no_way, by)
-    if len(final) == 1:
-        return f"a source of {first}"
-    others = "; ".join(f"of {_placed(one)}" for one in final[1:])
-    return f"{len(final)} sources: of {first}; {others}"
-
-
-def _placed(estimate: Estimate) -> str:
-    x, y = estimate.position_m[:2]
-    return f"{estimate.activity_mbq:.0f} MBq {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
-
-
-def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str) -> str:
-    place = _placed(estimate)
-    if no_way:
-        return f"{place}; {by}, no drivable way for the rover to reach it"
-    if spectrum is None:
-        return f"{place}; {by}, no spectrum was taken near it"
-    return f"{place}; {_identified(estimate, spectrum, by)}"
-
-
-def _identified(estimate: Estimate, spectrum: Spectrum, by: str) -> str:
-    """What the spectrum says of the nuclide under which the source was estimated."""
-    if spectrum.nuclide == "none":
-        return f"{by}, the spectrum shows none"
-    if spectrum.nuclide == "unknown":
-        return f"{by}, the spectrum is of none in the library with {spectrum.confidence:.0%}"
-    said = f"identified with {spectrum.confidence:.1%}"
-    if spectrum.nuclide != estimate.nuclide:
-        said = f"{by}, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
-    if spectrum.goodness < BAD_FIT:
-        said += f", but fits the spectrum badly (p = {spectrum.goodness:.1g})"
-    return said

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from swarmsim.config.mission import Knowledge
+from swarmsim.estimation.localise import sampled
+from swarmsim.estimation.posterior import Posterior
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
@@ -186,3 +188,36 @@ def test_useless_data_give_a_finite_answer_that_is_no_detection(localiser, case)
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(estimated.fits))
     assert not np.any(estimated.fits.present)
     assert np.all(np.abs(np.asarray(estimated.fits.position_m)[:, :2]) <= 90.0)
+
+
+def test_a_posterior_that_is_no_number_is_the_place_found_with_the_reach_of_the_search(localiser):
+    state = localiser.nothing
+    sources = replace(
+        state.sources, place=jnp.array([[3.0, -4.0, 1.0], [7.0, 8.0, 0.5]]), activity_bq=jnp.array([2e8, 1e8])
+    )
+    bad = jnp.full((4, 4), jnp.nan)
+    posterior = Posterior(
+        mean=jnp.array([[3.1, -4.1, 1.1, 19.0], [jnp.nan] * 4]),
+        covariance=jnp.stack([0.01 * jnp.eye(4), bad]),
+        effective=jnp.array([50.0, jnp.nan]),
+        halves=jnp.array([0.1, jnp.nan]),
+    )
+    converged, mean, covariance = sampled(localiser.presumed, localiser.params, sources, posterior)
+    reach = float(localiser.params.search.reach_m)
+    assert converged.tolist() == [True, False]
+    np.testing.assert_allclose(mean[0], posterior.mean[0])
+    np.testing.assert_allclose(covariance[0], 0.01 * np.eye(4))
+    np.testing.assert_allclose(mean[1], [7.0, 8.0, 0.5, np.log(1e8)], rtol=1e-6)
+    assert np.all(np.sqrt(np.diag(covariance[1])[:2]) >= reach)
+
+
+def test_places_worth_too_few_have_no_small_error(localiser):
+    few = Posterior(
+        mean=jnp.zeros((2, 4)),
+        covariance=jnp.broadcast_to(1e-4 * jnp.eye(4), (2, 4, 4)),
+        effective=jnp.array([50.0, 3.0]),
+        halves=jnp.array([2.0, 0.1]),
+    )
+    converged, _, covariance = sampled(localiser.presumed, localiser.params, localiser.nothing.sources, few)
+    assert converged.tolist() == [False, False]
+    assert np.all(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, :2]) > 1.0)

@@ -63,6 +63,7 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"samples": survey(rate=150e3)}, "saturated", "dead time"),
         ({"samples": survey(rate=2.0)}, "saturated", "dead time"),
         ({"fit": Fit(misfit=20.0, chi_squared=1.6)}, "inconsistent", "chi-squared 1.60"),
+        ({"fit": Fit(misfit=np.nan, chi_squared=np.nan)}, "inconsistent", "contradict the sources"),
         ({"aerial": (estimate(12.0, std=1.0),)}, "inconsistent", "12 m apart"),
         ({"final": (estimate(activity=19e6),)}, "inconsistent", "times"),
         ({"final": (replace(estimate(), converged=False),)}, "ambiguous", "could not be searched"),

@@ -1,0 +1,68 @@
+"""The sentence that says what a mission found, and why it is not to be believed where it is not."""
+
+from swarmsim.results.record import Estimate, Spectrum
+from swarmsim.results.status import Verdict
+
+NOTHING_SOUGHT = "nothing was sought"
+NOTHING_FOUND = "no source above background"
+BAD_FIT = 1e-3
+"""p-value below which the finding says that the named nuclide does not fit the spectrum."""
+
+
+def finding(
+    verdict: Verdict | None, final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, presumed: bool
+) -> str:
+    """What was found, and why it is not to be believed where it is not.
+
+    Args:
+        verdict: on the answer; None where no source was sought.
+        final: sources by all counts, the surest first.
+        spectrum: taken near the surest one; None where none was.
+        no_way: whether no rover had a drivable way to it.
+        presumed: whether one nuclide alone is in question.
+    """
+    by = "nuclide presumed" if presumed else "nuclide by the counts"
+    if verdict is None:
+        return NOTHING_SOUGHT
+    found = _found(final, spectrum, no_way, by)
+    if not verdict.reasons:
+        return found
+    return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
+
+
+def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, by: str) -> str:
+    if not final:
+        return NOTHING_FOUND
+    first = _surest(final[0], spectrum, no_way, by)
+    if len(final) == 1:
+        return f"a source of {first}"
+    others = "; ".join(f"of {_placed(one)}" for one in final[1:])
+    return f"{len(final)} sources: of {first}; {others}"
+
+
+def _placed(estimate: Estimate) -> str:
+    x, y = estimate.position_m[:2]
+    return f"{estimate.activity_mbq:.0f} MBq {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
+
+
+def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str) -> str:
+    place = _placed(estimate)
+    if no_way:
+        return f"{place}; {by}, no drivable way for the rover to reach it"
+    if spectrum is None:
+        return f"{place}; {by}, no spectrum was taken near it"
+    return f"{place}; {_identified(estimate, spectrum, by)}"
+
+
+def _identified(estimate: Estimate, spectrum: Spectrum, by: str) -> str:
+    """What the spectrum says of the nuclide under which the source was estimated."""
+    if spectrum.nuclide == "none":
+        return f"{by}, the spectrum shows none"
+    if spectrum.nuclide == "unknown":
+        return f"{by}, the spectrum is of none in the library with {spectrum.confidence:.0%}"
+    said = f"identified with {spectrum.confidence:.1%}"
+    if spectrum.nuclide != estimate.nuclide:
+        said = f"{by}, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
+    if spectrum.goodness < BAD_FIT:
+        said += f", but fits the spectrum badly (p = {spectrum.goodness:.1g})"
+    return said

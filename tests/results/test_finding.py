@@ -1,0 +1,53 @@
+"""The sentence of a mission's finding."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from swarmsim.results.finding import NOTHING_FOUND, NOTHING_SOUGHT, finding
+from swarmsim.results.record import Spectrum
+from swarmsim.results.status import Verdict
+from tests.results.test_status import estimate
+
+SURE = Verdict(status="located", reasons=(), covered=1.0)
+ONE = (estimate(),)
+
+
+def spectrum(nuclide: str, goodness: float = 0.4) -> Spectrum:
+    none = np.zeros(1)
+    return Spectrum(
+        energy_kev=none, counts=none, fit=none, background=none, live_s=1.0, nuclide=nuclide, confidence=0.97,
+        net_counts=100.0, goodness=goodness,
+    )  # fmt: skip
+
+
+def test_nothing_sought_and_nothing_found():
+    assert finding(None, (), None, no_way=False, presumed=False) == NOTHING_SOUGHT
+    assert finding(replace(SURE, status="none"), (), None, no_way=False, presumed=False) == NOTHING_FOUND
+
+
+@pytest.mark.parametrize(("presumed", "said"), [(True, "nuclide presumed"), (False, "nuclide by the counts")])
+def test_it_says_where_the_nuclide_is_from(presumed, said):
+    assert f"; {said}, no spectrum" in finding(SURE, ONE, None, no_way=False, presumed=presumed)
+    assert f"; {said}, no drivable way" in finding(SURE, ONE, None, no_way=True, presumed=presumed)
+    assert f"; {said}, the spectrum suggests Zn-65 with 97%" in finding(SURE, ONE, spectrum("Zn-65"), False, presumed)
+    assert f"; {said}, the spectrum shows none" in finding(SURE, ONE, spectrum("none"), False, presumed)
+    assert f"; {said}, the spectrum is of none in the library" in finding(
+        SURE, ONE, spectrum("unknown"), False, presumed
+    )
+
+
+def test_a_spectrum_that_names_it_says_how_well():
+    named = ONE[0].nuclide
+    assert finding(SURE, ONE, spectrum(named), False, False).endswith("; identified with 97.0%")
+    assert "fits the spectrum badly (p = 1e-05)" in finding(SURE, ONE, spectrum(named, 1e-5), False, False)
+
+
+def test_several_sources_and_doubts_are_told():
+    two = (estimate(), estimate(20.0, nuclide="Cs-137"))
+    doubt = Verdict(status="ambiguous", reasons=("a", "b"), covered=1.0)
+    said = finding(doubt, two, None, no_way=False, presumed=False)
+    assert said.startswith("ambiguous: 2 sources: of ")
+    assert "Cs-137 at (20.0" in said
+    assert said.endswith("; but a; b")
