@@ -17,8 +17,8 @@ ONE = (estimate(),)
 def spectrum(nuclide: str, goodness: float = 0.4) -> Spectrum:
     none = np.zeros(1)
     return Spectrum(
-        energy_kev=none, counts=none, fit=none, background=none, live_s=1.0, nuclide=nuclide, confidence=0.97,
-        net_counts=100.0, goodness=goodness,
+        energy_kev=none, counts=none, fit=none, background=none, live_time_s=1.0, nuclide=nuclide, confidence=0.97,
+        scores={}, goodness=goodness,
     )  # fmt: skip
 
 
