@@ -122,6 +122,8 @@ class Ground:
 def _check_sources(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     drawn = {varied.place[1] for varied in scenario.family if varied.distribution.place is not None}
     for i, source in enumerate(scenario.mission.sources):
+        if source.activity_mbq == 0.0:  # a family's mission has fewer sources than its largest one
+            continue
         if i in drawn:
             continue
         place: Place = ("sources", i, "position_m")
