@@ -167,7 +167,11 @@ class Knowledge(Model):
     sensitivity of a detector model by ``sensitivity_std``. ``nuclides`` are those in question. ``background_std`` is
     how much a background may differ from one window to the next, ``model_std`` what is presumed of errors of the model
     of the rates in a window, and ``spectrum_std`` of each region of its spectrum beside that, all as standard
-    deviations of logarithms.
+    deviations of logarithms. Errors of the model are alike in neighbouring windows, so that all of them together tell
+    less of a place than if each had its own: in the posterior the logarithm of the likelihood counts ``learning_rate``
+    times. The activity of a source is presumed to be ``activity_mbq``, give or take a factor of ``activity_factor``
+    (one standard deviation of its logarithm), which decides where counts allow for a hundred megabecquerels of one
+    nuclide or a terabecquerel of another.
     """
 
     site: Literal["exact", "geometry", "terrain", "none"] = "geometry"
@@ -178,6 +182,9 @@ class Knowledge(Model):
     background_std: float = Field(default=0.3, ge=0.01, le=1)
     model_std: float = Field(default=0.05, ge=0.001, le=1)
     spectrum_std: float = Field(default=0.02, ge=0, le=1)
+    learning_rate: float = Field(default=0.5, ge=0.01, le=1)
+    activity_mbq: float = Field(default=100.0, ge=1e-6, le=1e9)
+    activity_factor: float = Field(default=10.0, ge=1.1, le=1e9)
     nuclides: Literal["unknown"] | Annotated[tuple[Name, ...], Field(min_length=1, max_length=100)] = "unknown"
 
 

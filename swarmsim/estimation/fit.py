@@ -294,7 +294,9 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
     unit = at.information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
     root = jax.scipy.linalg.cholesky(unit, lower=True)
     log_volume = -jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(scale))
-    value = likelihood + log_volume + at.log_volume
+    # where nothing is left of an activity its logarithm says nothing
+    excess = (jnp.log(jnp.maximum(u.activity_bq, 1.0)) - problem.log_activity) / problem.log_activity_std
+    value = likelihood + log_volume + at.log_volume - 0.5 * jnp.square(excess)
     return Settled(
         value=jnp.where(jnp.isfinite(value), value, -jnp.inf),
         likelihood=jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf),

@@ -27,10 +27,14 @@ Span = tuple[int, int, int, int]
 
 @pytree
 class Nodes:
-    """Where the crystal is looked at from a source: ``rays`` places of each of m windows."""
+    """Where the crystal is looked at from a source: ``rays`` places of each of m windows.
+
+    Each stands for the part of the way that is nearest to it: two straight pieces, one before it and one after.
+    """
 
     position_m: jax.Array  # [rays m, 3]
     axis: jax.Array  # [rays m, 3]
+    pieces_m: jax.Array  # [rays m, 2, 3] from the place to the beginning of its part, and to the end
 
 
 @pytree
@@ -45,6 +49,9 @@ class Problem:
     background_std: jax.Array  # [] of a window's ln(background over the detector's level)
     model_std: jax.Array  # [] of a window's ln(true over modelled rate of the sources)
     pose_std_m: jax.Array  # [n] of a window's place
+    log_activity: jax.Array  # [] prior of ln(activity in Bq), its mean
+    log_activity_std: jax.Array  # []
+    learning_rate: jax.Array  # [] 0..1: how often the log likelihood counts in the posterior of a place
     trust: jax.Array  # [n, R] 0..1: the counts of a region in a window are worth so many times as many (`trust_of`)
     height_m: jax.Array  # [] prior of a source's height above ground
     height_std_m: jax.Array  # []
@@ -74,25 +81,60 @@ def nodes_of(site: Site, m: Measurements, span: Span) -> Nodes:
     """The nodes of a span's windows.
 
     With one ray a window has its middle; with more the first and the last end of the way are among them, so that a
-    shadow's edge that a window crosses is seen in the spread between its rays. The way of a vehicle that takes off or
-    turns is not straight: no end is taken to lie below the ground.
+    shadow's edge that a window crosses is seen in the spread between its rays. A way is two straight legs of equal
+    time, which the ends and the mean place tell: the corner between them lies as far beyond the mean as this lies off
+    the straight line between the ends. No place is taken to lie below the ground.
     """
     first, last, _, rays = span
-    position, travel, axis = (x[first:last] for x in (m.position_m, m.travel_m, m.axis))
-    if rays == 1:
-        return Nodes(position_m=position, axis=axis)
-    node = jnp.linspace(-0.5, 0.5, rays)
-    along = (position[:, None] + node[:, None] * travel[:, None]).reshape(-1, 3)
-    ground = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(along[:, :2])
-    along = along.at[:, 2].max(ground + LEAST_ABOVE_M)
-    return Nodes(position_m=along, axis=jnp.repeat(axis, rays, axis=0))
+    mean, travel, axis = (x[first:last] for x in (m.position_m, m.travel_m, m.axis))
+    chord = jnp.zeros_like(travel) if m.chord_m is None else m.chord_m[first:last]
+    corner = -2.0 * chord
+    # a vehicle that stands for long and drives off at last, or drives in circles, has no two legs of equal time
+    length, off = (jnp.linalg.norm(x, axis=-1, keepdims=True) for x in (travel, corner))
+    corner = corner * jnp.minimum(1.0, 0.5 * length / jnp.maximum(off, 1e-6))
+
+    def at(share: jax.Array) -> jax.Array:
+        """Places [m, ..., 3] at so much of the way."""
+        along, beside = share[..., None] - 0.5, 1.0 - jnp.abs(2.0 * share[..., None] - 1.0)
+        return (mean + chord)[:, None] + along * travel[:, None] + beside * corner[:, None]
+
+    share, low, high = _parts(rays)
+    position = at(share)
+    pieces = jnp.stack([at(low) - position, at(high) - position], axis=2)
+    ground = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(position[..., :2].reshape(-1, 2))
+    position = position.reshape(-1, 3)
+    return Nodes(
+        position_m=position.at[:, 2].max(ground + LEAST_ABOVE_M),
+        axis=jnp.repeat(axis, rays, axis=0),
+        pieces_m=pieces.reshape(-1, 2, 3),
+    )
+
+
+def _parts(rays: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Where on a way its nodes [rays] are, and where the parts that they stand for begin and end."""
+    share = jnp.linspace(0.0, 1.0, rays) if rays > 1 else jnp.array([0.5])
+    half = 0.5 / max(rays - 1, 1)
+    return share, jnp.maximum(share - half, 0.0), jnp.minimum(share + half, 1.0)
 
 
 def shares_of(rays: int) -> jax.Array:
-    """Weights [rays] of a window's nodes (trapezoidal rule)."""
-    if rays == 1:
-        return jnp.ones(1)
-    return jnp.ones(rays).at[jnp.array([0, rays - 1])].set(0.5) / (rays - 1)
+    """Shares [rays] of a way that its nodes stand for."""
+    _, low, high = _parts(rays)
+    return high - low
+
+
+def inverse_square_gain(offset_m: jax.Array, pieces_m: jax.Array, rays: int) -> jax.Array:
+    """Mean of 1/r² [rays m] over the parts of the ways over its value at their nodes.
+
+    ``offset_m`` [rays m, 3] from the source to the nodes, ``pieces_m`` [rays m, 2, 3] as those of `Nodes`.
+    """
+    share, low, high = _parts(rays)
+    weight = jnp.stack([share - low, high - share], axis=1) / (high - low)[:, None]  # [rays, 2]
+    middle = offset_m[:, None] + 0.5 * pieces_m
+    squared = jnp.maximum(jnp.sum(middle * middle, axis=-1), 1e-6)
+    mean = travel_gain(middle, pieces_m) / squared
+    mean = jnp.sum(weight * mean.reshape(-1, rays, 2), axis=-1).reshape(-1)
+    return jnp.sum(offset_m * offset_m, axis=-1) * mean
 
 
 def ways_from(problem: Problem, place: jax.Array) -> Ways:
@@ -141,9 +183,8 @@ def _rates_of_span(problem: Problem, span: Span, nodes: Nodes, source: Source, w
     offset = position - source.position_m
     detector = problem.detectors[number]
     rate, slope = roi_rates_and_slopes(detector, source, way, position, axis, problem.uncertain)
-    m = problem.measurements
-    gain = travel_gain(offset, m.travel_m[first:last]) if rays == 1 else jnp.ones(offset.shape[0])
-    exposure = m.exposure_s[first:last]
+    gain = inverse_square_gain(offset, nodes.pieces_m, rays)
+    exposure = problem.measurements.exposure_s[first:last]
 
     def over_windows(x: jax.Array) -> jax.Array:
         ones = [1] * (x.ndim - 1)

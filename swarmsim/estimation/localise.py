@@ -43,6 +43,9 @@ class Presumed:
     background_std: jax.Array  # [] of a window's ln(background over the level)
     model_std: jax.Array  # [] of a window's ln(true over modelled rate)
     spectrum_std: jax.Array  # [] of ln(true over modelled rate) of a region beside that
+    learning_rate: jax.Array  # [] how often the log likelihood counts in the posterior of a place
+    log_activity: jax.Array  # [] of a source, in Bq
+    log_activity_std: jax.Array  # []
     pose_std_m: jax.Array  # [] of measured places
     place_std_m: jax.Array  # [] error of a source's place that all windows have in common: of poses and walls
     sensitivity_std: jax.Array  # [] of ln(true over presumed sensitivity) of a detector
@@ -151,6 +154,9 @@ def presume(
         background_std=on_host(knowledge.background_std),
         model_std=on_host(model),
         spectrum_std=on_host(knowledge.spectrum_std),
+        learning_rate=on_host(knowledge.learning_rate),
+        log_activity=on_host(np.log(1e6 * knowledge.activity_mbq)),
+        log_activity_std=on_host(np.log(knowledge.activity_factor)),
         pose_std_m=on_host(knowledge.pose_std_m),
         place_std_m=on_host(np.hypot(knowledge.pose_std_m, 0.0 if exact else knowledge.geometry_std_m)),
         sensitivity_std=on_host(knowledge.sensitivity_std),
@@ -219,6 +225,9 @@ def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span
         material_std=jnp.asarray(presumed.material_std),
         background_std=jnp.asarray(presumed.background_std),
         model_std=jnp.asarray(presumed.model_std),
+        learning_rate=jnp.asarray(presumed.learning_rate),
+        log_activity=jnp.asarray(presumed.log_activity),
+        log_activity_std=jnp.asarray(presumed.log_activity_std),
         pose_std_m=jnp.sqrt(jnp.square(presumed.pose_std_m) + WAY_SHARE**2 * travel),
         height_m=jnp.asarray(presumed.height_m),
         height_std_m=jnp.asarray(presumed.height_std_m),

@@ -1,5 +1,7 @@
 """Detector measurements as arrays of fixed size, and their sums over windows."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 
@@ -19,6 +21,7 @@ class Measurements:
     valid: jax.Array  # [n] bool
     detector: jax.Array  # [n] int32, index into the tuple of detectors (UAV, rover)
     rois: jax.Array | None = None  # [n, R] the counts by region of interest
+    chord_m: jax.Array | None = None  # [n, 3] middle of the straight line between the ends of the way, less position_m
 
 
 def aggregate(measurements: Measurements, per_window: int) -> Measurements:
@@ -58,16 +61,19 @@ def aggregate(measurements: Measurements, per_window: int) -> Measurements:
     offset = jnp.sum(weight * (m.position_m - origin), axis=1)
     axis = jnp.sum(weight * m.axis, axis=1)
     norm = jnp.linalg.norm(axis, axis=-1, keepdims=True)
+    travel = jnp.sum(m.travel_m, axis=1)
+    begin = jnp.take_along_axis(m.position_m - 0.5 * m.travel_m, first[:, None, None], axis=1)
     return Measurements(
         time_s=jnp.max(m.time_s, axis=1),
         position_m=origin[:, 0] + offset,
-        travel_m=jnp.sum(m.travel_m, axis=1),
+        travel_m=travel,
         axis=jnp.where(norm > 1e-6, axis / jnp.maximum(norm, 1e-6), jnp.array([0.0, 0.0, 1.0])),
         counts=jnp.sum(m.counts, axis=1),
         exposure_s=total,
         valid=jnp.any(m.valid, axis=1),
         detector=jnp.take_along_axis(m.detector, first[:, None], axis=1)[:, 0],
         rois=None if m.rois is None else jnp.sum(m.rois, axis=1),
+        chord_m=(begin - origin)[:, 0] + 0.5 * travel - offset,
     )
 
 
@@ -83,8 +89,9 @@ def concatenate(*parts: Measurements) -> Measurements:
     def join(*leaves: jax.Array, trailing: int) -> jax.Array:
         return jnp.concatenate([flat(leaf, trailing) for leaf in leaves])
 
-    vectors = ("position_m", "travel_m", "axis")
+    vectors = ("position_m", "travel_m", "axis", "chord_m")
     names = set(Measurements.__dataclass_fields__) - {"rois"}  # type: ignore[attr-defined]
+    parts = tuple(p if p.chord_m is not None else replace(p, chord_m=jnp.zeros_like(p.travel_m)) for p in parts)
     fields = {f: join(*(getattr(p, f) for p in parts), trailing=int(f in vectors)) for f in names}
     regions = [part.rois for part in parts if part.rois is not None]
     if len(regions) < len(parts):
@@ -109,4 +116,5 @@ def cleared(m: Measurements) -> Measurements:
         valid=valid,
         detector=jnp.where(valid, m.detector, 0),
         rois=None if m.rois is None else jnp.where(valid[:, None], m.rois, 0.0),
+        chord_m=None if m.chord_m is None else jnp.where(valid[:, None], m.chord_m, 0.0),
     )

@@ -10,6 +10,9 @@ Places are drawn in rounds. Those of a round lie about places that the earlier o
 sampling: Cornuet, Marin, Mira and Robert, Scandinavian Journal of Statistics 39, 2012, 798). Rounds go on until the
 places are worth enough independent ones. Whatever else is unknown is fitted at each place; its own spread about that is
 normal.
+
+The likelihood is raised to a power below one, the learning rate (Holmes and Walker, Biometrika 104, 2017, 497): errors
+of the model are alike in neighbouring windows, and a posterior that takes each for one of its own is too narrow.
 """
 
 from collections.abc import Callable
@@ -261,20 +264,22 @@ def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_ro
     limits, s = bounds(problem), state.sources
     others = without(state, k).added
     u, nuclide = replace(state.unknowns, activity_bq=s.activity_bq[k]), s.nuclide[k]
+    rate = problem.learning_rate
 
     def weigh(place: jax.Array) -> Weighed:
         fit = settle(problem, ways_from(problem, place), nuclide, others, u, WEIGH_STEPS, exact=False)
+        of_height = 0.5 * height_precision(problem.height_std_m) * jnp.square(place[2] - problem.height_m)
         inside = jnp.all((place >= limits[0]) & (place <= limits[1]))
         return Weighed(
             place=place,
             log_activity=jnp.log(jnp.maximum(fit.unknowns.activity_bq, 1e-3)),
-            variance=fit.covariance[0, 0],
-            log_posterior=jnp.where(inside, fit.value, -jnp.inf),
+            variance=fit.covariance[0, 0] / rate,
+            log_posterior=jnp.where(inside, rate * fit.value - (1.0 - rate) * of_height, -jnp.inf),
         )
 
     known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
     known = known.at[2].set(height_precision(problem.height_std_m))
-    covariance = scaled_inverse(s.towards[k] + jnp.diag(known))
+    covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
     return sample_posterior(weigh, s.place[k], covariance, rounds, per_round)
 
 

@@ -64,7 +64,8 @@ def gathered(
         few = merged(held, kept)
         keys = randomness.per_vehicle(randomness.consumer(key, "pose"), jnp.int32(0), jnp.asarray(group.member))
         off = plan.presumed.pose_std_m * jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
-        few = replace(few, position_m=few.position_m + few.exposure_s[..., None] * off[:, None])
+        shifted = few.position_m + few.exposure_s[..., None] * off[:, None]
+        few = replace(few, position_m=shifted, begin_m=few.begin_m + off[:, None])
         parts.append(measured(few, group.counter.index))
         groups.append((parts[-1].counts.shape[0], group.counter.index, plan.localisation.rays))
     return concatenate(*parts), spans_of(groups)

@@ -17,13 +17,15 @@ Status = Literal[
 CERTAIN: tuple[Status, ...] = ("located", "none", "not_sought")
 """Statuses that stand for an answer; with the others ``swarmsim run --strict`` ends with 3."""
 
-SATURATED_SHARE = 0.6  # of the highest rate that a counter can show: a quarter of the pulses is lost
+SATURATED_SHARE = 0.75  # of the highest rate that a counter can show: a paralysable one loses a third of the pulses
 PARALYSED_SHARE = 0.1  # of the nominal background: a counter that shows less is paralysed or broken
 COVERED_SHARE = 0.8  # of the survey area must have been measured
 REACH_HEIGHTS = 1.0  # a measurement covers the ground around it up to its own height, at least `REACH_M`
 REACH_M = 8.0
 FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
+COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
+COMPANION_SHARE = 0.25  # of the stronger one's activity
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
@@ -137,7 +139,21 @@ def _doubts(
         std = np.sqrt(np.maximum(np.linalg.eigvalsh(np.asarray(one.covariance_m2)[:2, :2])[-1], 0.0))
         if std > FAR_STD_M:
             found.append(("detected", f"the place of the {one.nuclide} source is known to {std:.0f} m only"))
+    found += _companions(final)
     found += _unexplained(chart, final, background_std)
+    return found
+
+
+def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
+    """Faint sources beside a strong one of the same nuclide: errors of the model of walls look like them."""
+    found: list[tuple[Status, str]] = []
+    for faint in final:
+        for strong in final:
+            apart = float(np.linalg.norm(np.asarray(faint.position_m)[:2] - np.asarray(strong.position_m)[:2]))
+            less = faint.activity_mbq < COMPANION_SHARE * strong.activity_mbq
+            if faint.nuclide == strong.nuclide and less and apart < COMPANION_M:
+                text = f"the {faint.nuclide} source of {faint.activity_mbq:.2g} MBq {apart:.0f} m beside a stronger one"
+                found.append(("ambiguous", f"{text} may be an error of the model"))
     return found
 
 

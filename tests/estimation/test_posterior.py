@@ -119,19 +119,23 @@ def integral(problem, state, reach):
     x, y = np.meshgrid(12.0 + np.linspace(-reach, reach, 35), 4.0 + np.linspace(-reach, reach, 35))
     places = jnp.asarray(np.stack([x.ravel(), y.ravel(), np.ones(x.size)], -1), jnp.float32)
     theta, value, own = (np.asarray(v, np.float64) for v in _grid(problem, state, places))
-    weight = np.exp(value - value.max())
+    rate = float(problem.learning_rate)
+    weight = np.exp(rate * (value - value.max()))
     weight /= weight.sum()
     assert weight.reshape(35, 35)[[0, -1]].sum() + weight.reshape(35, 35)[:, [0, -1]].sum() < 0.02
     mean = weight @ theta
     variance = weight @ (theta - mean) ** 2
-    variance[3] += weight @ own
+    variance[3] += weight @ own / rate
     return mean, np.sqrt(variance)
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("boxes", "reach", "near"), [([], 4.5, 0.15), (WALLS, 1.7, 0.4)], ids=["open", "walls"])
-def test_moments_are_those_of_the_integral(boxes, reach, near, seed):
+@pytest.mark.parametrize(
+    ("boxes", "rate", "reach", "near"), [([], 1.0, 4.5, 0.15), ([], 0.4, 7.2, 0.15), (WALLS, 1.0, 1.7, 0.4)]
+)
+def test_moments_are_those_of_the_integral(boxes, rate, reach, near, seed):
     problem, state = told(boxes, seed)
+    problem = replace(problem, learning_rate=jnp.float32(rate))
     mean, std = integral(problem, state, reach)
     found = _sample(problem, state)
     sampled = np.sqrt(np.diag(found.covariance))

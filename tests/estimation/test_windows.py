@@ -1,5 +1,6 @@
 """Samples added up over windows while vehicles measure, against the sums of all samples at once."""
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -47,7 +48,8 @@ def assert_equal(found, expected):
     """All but places, whose mean over a window is taken of large numbers here and of differences there."""
     for name in ("time_s", "travel_m", "axis", "counts", "rois", "exposure_s", "valid", "detector"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=2e-5, atol=1e-5, err_msg=name)
-    np.testing.assert_allclose(found.position_m, expected.position_m, atol=3e-4)
+    for name in ("position_m", "chord_m"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=3e-4, err_msg=name)
 
 
 @pytest.mark.parametrize("portions", [[FRAMES], [1] * FRAMES, [0, 13, 40, 7]])
@@ -131,17 +133,37 @@ def test_windows_are_put_together_until_they_fit(most):
         np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-2, err_msg=name)
     np.testing.assert_array_equal(few.samples, windows.samples)
     for vehicle in range(VEHICLES):
-        together = -(-used[vehicle] // most)
-        time = np.asarray(few.time_s)[vehicle]
-        left = -(-used[vehicle] // together)
-        # neighbours in their order: each ends with the last of so many windows
-        ends = np.minimum(np.arange(1, left + 1) * together, used[vehicle]) - 1
-        np.testing.assert_array_equal(time[:left], np.asarray(windows.time_s)[vehicle, ends])
-        np.testing.assert_array_equal(np.asarray(few.exposure_s)[vehicle] > 0.0, np.arange(most) < left)
-        counts = np.asarray(windows.counts)[vehicle, : used[vehicle]]
+        time, exposure, begin = (np.asarray(x)[vehicle] for x in (windows.time_s, windows.exposure_s, windows.begin_m))
+        filled = np.flatnonzero(np.asarray(few.exposure_s)[vehicle] > 0.0)
+        # neighbours in their order: each ends with one of the windows, and begins after the one before it
+        ends = np.searchsorted(time[: used[vehicle]], np.asarray(few.time_s)[vehicle, filled])
+        assert np.all(np.diff(ends) > 0)
+        assert ends[-1] == used[vehicle] - 1
+        starts = np.concatenate([[0], ends[:-1] + 1])
+        np.testing.assert_allclose(np.asarray(few.begin_m)[vehicle, filled], begin[starts])
         np.testing.assert_allclose(
-            np.asarray(few.counts)[vehicle, :left], np.add.reduceat(counts, np.arange(0, used[vehicle], together))
+            np.asarray(few.exposure_s)[vehicle, filled], np.add.reduceat(exposure[: used[vehicle]], starts), rtol=1e-5
         )
+
+
+def test_windows_are_short_where_counts_are_many():
+    """A vehicle passes a source at constant speed: windows near it are put together least."""
+    along = np.arange(-100.0, 100.0)
+    rate = 20.0 + 1e5 / (along**2 + 16.0)
+    count, zero = len(along), jnp.zeros((1, len(along)))
+    at = jnp.asarray(np.stack([along, 0.0 * along, 0.0 * along], axis=-1)[None], jnp.float32)
+    windows = replace(
+        windows_start(1, count, ROIS), time_s=zero + jnp.arange(1.0, count + 1.0), position_m=at,
+        begin_m=at - jnp.array([0.5, 0.0, 0.0]), travel_m=jnp.zeros((1, count, 3)).at[..., 0].set(1.0),
+        counts=jnp.asarray(rate[None], jnp.float32), exposure_s=zero + 1.0,
+    )  # fmt: skip
+    few = merged(windows, 60)
+    length = np.asarray(few.travel_m)[0, :, 0]
+    where = np.asarray(few.position_m)[0, :, 0] / np.maximum(np.asarray(few.exposure_s)[0], 1e-9)
+    assert length[np.abs(where) < 5.0].max() == 1.0
+    far = length[(np.abs(where) > 50.0) & (length > 0.0)]
+    assert 4.0 <= far.mean() <= 10.0
+    assert far.max() < 2.0 * far.min() + 1.0
 
 
 @pytest.mark.parametrize("most", [9, 12, 20])
@@ -151,6 +173,6 @@ def test_windows_that_fit_stay_as_they_are(most):
     assert int((windows.exposure_s > 0.0).sum(axis=1).max()) <= 9
     few = merged(windows, most)
     kept = min(most, 12)
-    for name in ("time_s", "position_m", "travel_m", "axis", "counts", "exposure_s", "rois"):
+    for name in ("time_s", "position_m", "travel_m", "begin_m", "axis", "counts", "exposure_s", "rois"):
         np.testing.assert_array_equal(getattr(few, name)[:, :kept], getattr(windows, name)[:, :kept], err_msg=name)
         assert not np.any(getattr(few, name)[:, kept:])

@@ -71,6 +71,7 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"final": (estimate(std=14.0),)}, "detected", "known to 14 m"),
         ({"final": (estimate(), estimate(20.0, std=14.0, nuclide="Cs-137"))}, "detected", "Cs-137 source is known to"),
         ({"hotspots": ((0.0, 0.0), (-28.0, 0.0))}, "ambiguous", "further sources"),
+        ({"final": (estimate(), estimate(6.0, activity=20.0))}, "ambiguous", "20 MBq 6 m beside a stronger one"),
     ],
 )
 def test_each_doubt_has_its_status_and_sentence(given, status: str, said: str) -> None:
@@ -82,6 +83,14 @@ def test_each_doubt_has_its_status_and_sentence(given, status: str, said: str) -
 
 def test_a_source_that_the_survey_did_not_show_is_compared_with_none() -> None:
     assert verdict(aerial=(estimate(30.0, std=0.5, nuclide="Cs-137"),)).status == "located"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"x": 15.0, "activity": 20.0}, {"x": 6.0, "activity": 90.0}, {"x": 6.0, "activity": 20.0, "nuclide": "I-131"}],
+)
+def test_companions_that_walls_do_not_explain_are_no_doubt(other) -> None:
+    assert verdict(final=(estimate(), estimate(**other))).status == "located"
 
 
 def test_a_hotspot_that_a_further_source_explains_is_no_doubt() -> None:
