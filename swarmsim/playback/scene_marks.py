@@ -43,9 +43,11 @@ def _send_truth(stream: rr.RecordingStream, path: str, record: MissionRecord, so
     if source.carrier is not None:
         carrier = record.vehicles[source.carrier]
         _pin(stream, path, np.zeros(3), 7.0, f"{label}, on {carrier.name}", TRUTH, static=True)
-        places = rr.Transform3D.columns(translation=record.track_of(source))
+        time_s, track = np.asarray(carrier.time_s, float), record.track_of(source)
+        if len(time_s) and time_s[0] > record.start_s:  # it waits where it will start
+            time_s, track = np.r_[record.start_s, time_s], np.concatenate([track[:1], track])
         for entity in (f"world/{path}/pin", f"world/labels/{path}"):
-            stream.send_columns(entity, times(carrier.time_s), places)
+            stream.send_columns(entity, times(time_s), rr.Transform3D.columns(translation=track))
         return
     if source.corners_m is not None and source.points_m is not None:
         label, corners = f"{label}, {extent(source)}", np.asarray(source.corners_m, float)
