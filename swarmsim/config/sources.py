@@ -38,8 +38,9 @@ class Source(Model):
     origin in the body frame (FLU). ``height_m`` is above the terrain, below each part of a line or an area.
     ``activity_mbq`` is that of the whole source at the start of the mission; it decays with the nuclide's half-life.
 
-    A line or an area is computed as points at most ``spacing_m`` apart (1 m): count rates are then within 1 % of the
-    integral at twice that distance, and within 3 % at that distance itself.
+    A line or an area is computed as points at most ``spacing_m`` apart (1 m without it). In free air their rates are
+    those of the integral within 0.5 % from twice that distance on, and within 4 % at that distance itself, so half the
+    distance at which detectors pass is near enough. Each point costs a ray to every detector.
     """
 
     nuclide: Name
