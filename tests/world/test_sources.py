@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from swarmsim.config.load import load_named
+from swarmsim.estimation import Measurements
+from swarmsim.missions.knowledge import accumulate_spectrum
 from swarmsim.missions.trail import followed, poses_at, trail_start
 from swarmsim.physics.rotations import rotate
 from swarmsim.radiation.rate import observed_rois
@@ -157,3 +159,38 @@ def test_the_trail_of_a_carrier_is_read_by_time():
     short = followed(made, trail_start(made, state, 4), state, jnp.array(False))
     np.testing.assert_allclose(poses_at(short, jnp.float32(3.0)).position_m[0, :2], [0.0, -10.0], atol=1e-5)
     assert poses_at(None, jnp.float32(0.0)) is None
+
+
+def test_the_spectrum_of_a_carried_source_is_drawn_where_it_was():
+    made = carried("rover0")
+    state = begin(made, jax.random.key(0))
+    start = state.groups[1].vehicle.body.position_m[0]
+    trail = trail_start(made, state, 3)
+    rover = state.groups[1]
+    gone = replace(rover.vehicle.body, position_m=rover.vehicle.body.position_m + jnp.array([8.0, 0.0, 0.0]))
+    later = at_tick(
+        replace(state, groups=(state.groups[0], replace(rover, vehicle=replace(rover.vehicle, body=gone)))), 800
+    )
+    trail = followed(made, trail, later, jnp.array(True))
+    x, y, z = (float(v) for v in start + jnp.array(OFFSET) + jnp.array([4.0, 0.0, 0.0]))
+    standing = {"nuclide": "Co-60", "position_m": (x, y), "height_m": z, "activity_mbq": 200.0}
+    members = row("uav", "tarot_t650", 1, (0.0, -10.0)) + row("rover", "orpheus", 2, (-5.0, 0.0))
+    same = world(members, sources=[SPRING, standing], sample_period_s={"nai_1p5x1p5": 0.1})
+    place = jnp.array([[0.0, -3.0, 2.0]])
+    samples = Measurements(
+        time_s=jnp.array([5.0]),
+        position_m=place,
+        travel_m=jnp.zeros((1, 3)),
+        axis=jnp.array([[0.0, 1.0, 0.0]]),
+        counts=jnp.zeros(1),
+        exposure_s=jnp.array([2.0]),
+        valid=jnp.array([True]),
+        detector=jnp.zeros(1, jnp.int32),
+    )
+    key, used = jax.random.key(3), jnp.array([True])
+    rolling = accumulate_spectrum(key, made, 0, samples, used, trail)
+    still = accumulate_spectrum(key, same, 0, samples, used)
+    assert float(jnp.sum(still.counts)) > 1000.0
+    np.testing.assert_allclose(jnp.sum(rolling.counts), jnp.sum(still.counts), rtol=2e-3)
+    with pytest.raises(ValueError, match="sources on vehicles"):
+        accumulate_spectrum(key, made, 0, samples, used)
