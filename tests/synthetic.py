@@ -21,6 +21,7 @@ from swarmsim.results.record import (
     Spectrum,
     TrueSource,
     VehicleRecord,
+    carried_m,
 )
 from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
 
@@ -305,3 +306,20 @@ def swarm(count: int = 200, duration_s: float = 300.0, log_hz: float = 10.0) -> 
         events=(),
         finding="nothing was sought",
     )
+
+
+def forms(record: MissionRecord) -> MissionRecord:
+    """The mission with a line, an area and a source on its rover in place of its source."""
+    line = np.array([[-20.0, -30.0, 1.0], [0.0, -30.0, 1.0]])
+    area = np.array([[30.0, 30.0, 1.0], [40.0, 30.0, 1.0], [40.0, 38.0, 1.0], [30.0, 38.0, 1.0]])
+    rover = next(k for k, vehicle in enumerate(record.vehicles) if not vehicle.flies)
+    offset = np.array([0.5, 0.0, 0.2])
+    carrier = record.vehicles[rover]
+    start = carried_m(carrier.position_m[:1], carrier.quaternion[:1], offset)[0]
+    points = [corners.mean(axis=0) + 0.5 * (corners - corners.mean(axis=0)) for corners in (line, area)]
+    sources = (
+        TrueSource("Cs-137", line.mean(axis=0), 300.0, form="line", points_m=points[0], corners_m=line),
+        TrueSource("I-131", area.mean(axis=0), 500.0, form="area", points_m=points[1], corners_m=area),
+        TrueSource("F-18", start, 100.0, form="carried", carrier=rover, offset_m=offset),
+    )
+    return dataclasses.replace(record, sources=sources)

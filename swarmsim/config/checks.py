@@ -17,6 +17,7 @@ from swarmsim.config.mission import TEAM_MAX, Mission
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.phases import check_phases
 from swarmsim.config.site import SiteSpec
+from swarmsim.config.sources import POINTS_MAX, points_of
 from swarmsim.config.team import RESERVED, team_size
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 
@@ -100,6 +101,7 @@ def check_consistency(scenario: Scenario) -> list[Problem]:
         _check_timing,
         _check_materials,
         _check_names,
+        _check_sources,
         _check_pads,
         _check_estimates,
         check_phases,
@@ -194,6 +196,33 @@ def _check_names(scenario: Scenario) -> Iterator[Problem]:
             message = f"vehicles.{first[name]} has the same name: names must differ"
             yield scenario.problem(("vehicles", i, "name"), message, given=name)
         first.setdefault(name, i)
+
+
+def _check_sources(scenario: Scenario) -> Iterator[Problem]:
+    """Vehicles that are to carry a source and do not exist, and lines and areas that need too many points."""
+    names, total = [member.name for member in scenario.members], 0
+    for i, source in enumerate(scenario.mission.sources):
+        if source.on is not None:
+            if source.on not in names:
+                message, hint = f"there is no vehicle '{source.on}'", did_you_mean(source.on, names)
+                yield scenario.problem(("sources", i, "on"), message, allowed=one_of(names), suggestion=hint)
+            continue
+        try:
+            count = len(points_of(source).share)
+        except ValueError as error:
+            count, told = POINTS_MAX + 1, str(error)
+        else:
+            told = str(count)
+        total += count
+        if total > POINTS_MAX:
+            yield scenario.problem(
+                ("sources", i, source.place_field),
+                f"the {source.form} is too large to be computed as points {source.spacing:g} m apart",
+                given=f"{told} points",
+                allowed=f"at most {POINTS_MAX} of all sources of a mission",
+                suggestion="set a larger spacing_m: half the distance at which detectors pass is near enough",
+            )
+            return
 
 
 def _check_pads(scenario: Scenario) -> Iterator[Problem]:

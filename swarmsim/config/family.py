@@ -231,6 +231,9 @@ def _check(document: Document, key: str, place: Place, schema: Schema, drawn: Di
     for kind, field in (("place", "position_m"), ("any_nuclide", "nuclide")):
         if drawn.kind == kind and (not source or place[2:] != (field,)):
             raise wrong(f"is for sources.*.{field}", given=key)
+    if drawn.place is not None and document.data["sources"][place[1]].get("position_m") is None:
+        message = f"places point sources, and sources.{place[1]} has no position_m"
+        raise wrong(message, given=key, suggestion="name the sources that are points, such as sources.0.position_m")
     if drawn.interval is not None:
         number = schema.get("type")
         if number not in ("number", "integer"):

@@ -7,6 +7,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from swarmsim.config.base import Delay, Duration, Fraction, Gap, Length, Model, Name, Vec2
 from swarmsim.config.flight import Failsafes, FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
+from swarmsim.config.sources import Source
 from swarmsim.config.vary import SOURCES_MAX, VARIED_MAX, Distribution, VariedPath
 from swarmsim.config.vehicles import Vehicle
 
@@ -32,15 +33,6 @@ class Timing(Model):
     def time_step_s(self) -> float:
         """Time step of the physics, s."""
         return self.control_period_s / self.physics_steps
-
-
-class Source(Model):
-    """A radioactive point source: truth, known to the simulation and not to the mission."""
-
-    nuclide: Name
-    position_m: Vec2
-    height_m: float = Field(ge=-5, le=100)
-    activity_mbq: float = Field(ge=0, le=1e9)
 
 
 class Formation(Model):

@@ -14,6 +14,7 @@ from swarmsim.config.documents import Place
 from swarmsim.config.errors import Problem, first_problems
 from swarmsim.config.policies import ApproachAndOrbit, Orbit, ParallelLines, Waypoints, line_spacing
 from swarmsim.config.scenario import Scenario
+from swarmsim.config.sources import points_of
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 
 if TYPE_CHECKING:
@@ -124,20 +125,25 @@ def _check_sources(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     for i, source in enumerate(scenario.mission.sources):
         if source.activity_mbq == 0.0:  # a family's mission has fewer sources than its largest one
             continue
-        if i in drawn:
+        if i in drawn or source.height_m is None:  # a carried one is where its vehicle is
             continue
-        place: Place = ("sources", i, "position_m")
-        xy, given = np.array(source.position_m), str(list(source.position_m))
-        if not ground.holds(xy):
+        place: Place = ("sources", i, source.place_field)
+        outside = [list(corner) for corner in source.corners_m if not ground.holds(np.array(corner))]
+        if outside:
+            given = ", ".join(map(str, outside))
             yield scenario.problem(place, "the source lies outside the site", given=given, allowed=ground.extent)
             continue
-        blocked = np.flatnonzero(ground.blocked(ground.above(xy[None], source.height_m)[0]))
-        if blocked.size:
-            k = int(blocked[0])
+        points = ground.above(points_of(source).xy_m, source.height_m)
+        within, boxes = np.nonzero(ground.blocked(points))
+        if len(boxes):
+            k, lies = int(boxes[0]), "the source lies"
+            given = str(list(source.position_m)) if source.position_m else _point(points[within[0], :2])
+            if source.form != "point":
+                lies = f"{len(set(within))} of the {len(points)} points of the source lie"
             what = "the wall of a building" if ground.wall[k] > 0 else "a solid obstacle"
             yield scenario.problem(
                 place,
-                f"the source lies inside {what} of {ground.material[k]}",
+                f"{lies} inside {what} of {ground.material[k]}",
                 given=f"{given}, height_m {source.height_m:g}",
                 allowed="the open, or the hollow inside of a building",
                 suggestion=f"the obstacle's centre is at {_point(ground.centre[k, :2])}; move the source by the wall's "

@@ -11,6 +11,7 @@ from swarmsim.config.documents import Place
 from swarmsim.config.errors import InputError
 from swarmsim.config.family import COUNT, Varied
 from swarmsim.config.scenario import Scenario
+from swarmsim.config.sources import points_of
 from swarmsim.config.vary import Region
 from swarmsim.families.streams import Stream, chosen, drawn
 from swarmsim.site.model import SiteModel
@@ -123,7 +124,10 @@ class Drawer:
         found: Row = {}
         regions: dict[str, Region] = {}
         drawing = {_source(varied.place) for varied in placed}
-        taken = [source["position_m"] for number, source in enumerate(sources) if number not in drawing]
+        taken: list[Any] = []
+        for number, source in enumerate(sources):
+            if number not in drawing:
+                taken += [source["position_m"]] if source["position_m"] else self._spread(number)
         for varied in placed:
             place = varied.distribution.place
             assert place is not None
@@ -139,11 +143,14 @@ class Drawer:
             taken.append(found[varied.path])
         return found, regions, None
 
+    def _spread(self, number: int) -> list[Any]:
+        """Places of a line or an area; none of a source on a vehicle, which is nowhere before the mission begins."""
+        source = self._scenario.mission.sources[number]
+        return [] if source.on is not None else points_of(source).xy_m.tolist()
+
     def _sources(self, row: Row) -> list[Row]:
         """The mission's sources with the values of a row."""
-        sources: list[Row] = [
-            {**source.model_dump(), "position_m": list(source.position_m)} for source in self._scenario.mission.sources
-        ]
+        sources: list[Row] = [source.model_dump(mode="json") for source in self._scenario.mission.sources]
         for varied in self._others:
             if (number := _source(varied.place)) >= 0:
                 inner: Any = sources[number]
@@ -160,6 +167,7 @@ class Drawer:
             number, place = _source(varied.place), varied.distribution.place
             assert place is not None
             own = self._scenario.mission.sources[number].height_m
+            assert own is not None  # a source that is placed is a point
             for height in set(heights.get(number) or (own,)):
                 for region in place.regions:
                     if (varied.key, region, height) not in told:

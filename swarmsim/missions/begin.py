@@ -22,6 +22,7 @@ from swarmsim.missions.acting import (
 )
 from swarmsim.missions.plan import Phase, Plan
 from swarmsim.missions.state import NO_PHASE, MissionState, PhaseState, Signals, Survey
+from swarmsim.missions.trail import trail_start
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Situation
 from swarmsim.world import events
@@ -47,6 +48,7 @@ def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionStat
         windows=windows,
         survey=_no_survey(world, plan, windows, key),
         over_s=jnp.asarray(jnp.inf, jnp.float32),
+        trail=trail_start(world, state, plan.trail) if plan.trail else None,
     )
     seen = views(world, plan, state, mission.belief)
     mission = replace(mission, phases=tuple(_idle(world, plan, phase, mission, seen) for phase in plan.phases))

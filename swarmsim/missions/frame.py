@@ -39,6 +39,7 @@ from swarmsim.sensors.radiation import Reading
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world import events
 from swarmsim.world.counting import counted, not_seen, noted
+from swarmsim.world.emission import poses_of
 from swarmsim.world.judge import look_around, record_events
 from swarmsim.world.model import Group, Limits, World
 from swarmsim.world.radio import Heard
@@ -84,16 +85,22 @@ def frame(world: World, plan: Plan, mission: MissionState) -> MissionState:
     mission = replace(mission, world=seen)
     mission = replace(mission, phases=ask(world, plan, mission))
     tick, running = mission.world.clock.tick, mission.world.clock.running
-    groups, phases = list(mission.world.groups), list(mission.phases)
-    for number in range(len(groups)):
+    before, phases = mission.world.groups, list(mission.phases)
+    gone: list[_Flown] = []
+    for number in range(len(before)):
         roles = _roles(world, plan, number)
-        flown = _fly(world, plan, mission, number, roles, collided[number])
-        groups[number] = counted(
-            world, world.groups[number], mission.world.key, tick, world.timing.judge_ticks, running[number],
-            mission.world.groups[number], flown.state, flown.seen,
-        )  # fmt: skip
-        for role, part, done_s in zip(roles, flown.parts, flown.done_s, strict=True):
+        gone.append(_fly(world, plan, mission, number, roles, collided[number]))
+        for role, part, done_s in zip(roles, gone[-1].parts, gone[-1].done_s, strict=True):
             phases[role.number] = _with_part(phases[role.number], role, part, done_s)
+    poses = partial(poses_of, world.emission)
+    carriers = poses([g.vehicle.body for g in before]), poses([flown.state.vehicle.body for flown in gone])
+    groups = [
+        counted(
+            world, world.groups[number], mission.world.key, tick, world.timing.judge_ticks, running[number],
+            before[number], flown.state, flown.seen, carriers=carriers,
+        )
+        for number, flown in enumerate(gone)
+    ]  # fmt: skip
     clock = replace(mission.world.clock, tick=tick + world.timing.judge_ticks)
     return replace(mission, phases=tuple(phases), world=replace(mission.world, groups=tuple(groups), clock=clock))
 

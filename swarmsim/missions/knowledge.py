@@ -18,6 +18,7 @@ from swarmsim.estimation.forward import Span, spans_of
 from swarmsim.estimation.windows import Windows, measured, merged
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey
+from swarmsim.missions.trail import Trail, poses_at
 from swarmsim.pytree import pytree
 from swarmsim.radiation.background import background_factor
 from swarmsim.radiation.detector import Source
@@ -26,6 +27,7 @@ from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
 from swarmsim.sensors.radiation import length_factors, sensitivity_factor
 from swarmsim.site import crossed
+from swarmsim.world.emission import sources_at
 from swarmsim.world.model import World
 
 
@@ -90,18 +92,25 @@ def survey(plan: Plan, measurements: Measurements, spans: tuple[Span, ...]) -> S
 
 
 def conclude(
-    key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements, spans: tuple[Span, ...]
+    key: jax.Array,
+    world: World,
+    plan: Plan,
+    known: Survey,
+    measurements: Measurements,
+    spans: tuple[Span, ...],
+    trail: Trail | None = None,
 ) -> Conclusion:
     """Identify the nuclide from the spectra near the first source, and estimate the sources from all counts.
 
-    ``world`` is asked for the spectra alone: they are drawn here, at the places of the measurements.
+    ``world`` is asked for the spectra alone, and the ``trail`` of its carried sources: they are drawn here, at the
+    places and times of the measurements.
     """
     assert plan.localisation is not None
     assert plan.presumed is not None
     state = known.estimated.state
     spectrum, identification = None, None
     if plan.spectrometer >= 0:
-        spectrum = _spectrum(key, world, plan, known, measurements)
+        spectrum = _spectrum(key, world, plan, known, measurements, trail)
         identification = identify(plan.detectors[plan.spectrometer], spectrum.counts, spectrum.live_s)
         inside = jnp.asarray(plan.presumed.nuclides)[jnp.maximum(identification.nuclide, 0)]
         named = (identification.confidence >= plan.confidence_min) & (identification.nuclide >= 0) & inside
@@ -112,16 +121,18 @@ def conclude(
     return Conclusion(survey=known, spectrum=spectrum, identification=identification, estimated=estimated)
 
 
-def _spectrum(key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements) -> Accumulated:
+def _spectrum(
+    key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements, trail: Trail | None
+) -> Accumulated:
     """The spectrum taken by the spectrometer within its radius of the first source."""
     apart = measurements.position_m[:, :2] - known.estimated.fits.position_m[0, :2]
     near = jnp.sqrt(jnp.sum(apart * apart, axis=-1)) < plan.spectrum_radius_m
     used = near & measurements.valid & (measurements.detector == plan.spectrometer) & known.found
-    return accumulate_spectrum(key, world, plan.spectrometer, measurements, used)
+    return accumulate_spectrum(key, world, plan.spectrometer, measurements, used, trail)
 
 
 def accumulate_spectrum(
-    key: jax.Array, world: World, model: int, samples: Measurements, used: jax.Array
+    key: jax.Array, world: World, model: int, samples: Measurements, used: jax.Array, trail: Trail | None = None
 ) -> Accumulated:
     """The spectrum taken during the samples that are ``used`` [n], by detector model ``model``.
 
@@ -135,21 +146,23 @@ def accumulate_spectrum(
     per_exposure = detector.sample_period_s if detector.kind == "paper_ideal" else jnp.ones(())
     live = jnp.where(used, samples.exposure_s * per_exposure, 0.0)
 
-    def one(position: jax.Array, axis: jax.Array) -> jax.Array:
+    def one(position: jax.Array, axis: jax.Array, time_s: jax.Array) -> jax.Array:
+        sources = sources_at(world.sources, world.emission, time_s, poses_at(trail, time_s))
+
         def of_source(source: Source) -> jax.Array:
             way = crossed(site, source.position_m, position)
             way = replace(way, length_m=way.length_m * lengths)
             return sensitivity * spectrum_rate(detector, source, way, position, axis)
 
         natural = background_factor(background, site, key, position, detector.background_height_m)
-        return jnp.sum(jax.vmap(of_source)(world.sources), axis=0) + natural * detector.background_spectrum
+        return jnp.sum(jax.vmap(of_source)(sources), axis=0) + natural * detector.background_spectrum
 
-    def add(total: jax.Array, sample: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        position, axis, live = sample
-        counted = jax.lax.cond(live > 0.0, lambda: live * one(position, axis), lambda: jnp.zeros_like(total))
+    def add(total: jax.Array, sample: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
+        position, axis, middle_s, live = sample
+        counted = jax.lax.cond(live > 0.0, lambda: live * one(position, axis, middle_s), lambda: jnp.zeros_like(total))
         return total + counted, None
 
     start = jnp.zeros_like(detector.background_spectrum)
-    mean = jax.lax.scan(add, start, (samples.position_m, samples.axis, live))[0]
+    mean = jax.lax.scan(add, start, (samples.position_m, samples.axis, samples.time_s - 0.5 * live, live))[0]
     keys = jax.random.split(randomness.consumer(key, "spectrum"), mean.shape[0])
     return Accumulated(counts=jax.vmap(poisson)(keys, mean), live_s=jnp.sum(live))

@@ -137,3 +137,4 @@ class Plan:
     kept: tuple[int, ...] = static()  # for each group: windows of each vehicle that the estimate uses
     bin_cells: int = static()  # side of a bin of the team's belief, in cells of the map
     spectrometer: int = static()  # detector model whose spectra are identified; -1 for none
+    trail: int = static(default=0)  # decision periods in which the places of carried sources are kept for the spectra

@@ -64,7 +64,16 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
         kept=tuple(_kept_windows(group) for group in world.groups),
         bin_cells=1 if mapping is None else default_bin_cells(mapping),
         spectrometer=-1 if identification is None else _spectrometer(world),
+        trail=0 if identification is None else _trail(scenario, world),
     )
+
+
+def _trail(scenario: Scenario, world: World) -> int:
+    """Decision periods that a phase can be under way in, and the start; 0 where no source is carried."""
+    if world.emission.carrier is None:
+        return 0
+    phases = scenario.mission.phases  # each may end a period after its time is up
+    return 2 + sum(math.ceil(phase.time_limit_s / world.timing.decision_period_s) + 1 for phase in phases)
 
 
 @kept(4)

@@ -12,6 +12,7 @@ from swarmsim.estimation.windows import gather
 from swarmsim.missions.frame import frame
 from swarmsim.missions.plan import Phase, Plan, Trigger
 from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track
+from swarmsim.missions.trail import followed
 from swarmsim.world import events
 from swarmsim.world.model import World
 from swarmsim.world.state import moving, now_s
@@ -38,6 +39,8 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     tracks = jax.tree.map(lambda x: x[every - 1 :: every], tracks)
     mission = _whole(mission, moved)
     mission = _learned(world, plan, mission, samples)
+    runs = [jnp.isfinite(phase.began_s) & ~jnp.isfinite(phase.ended_s) for phase in mission.phases]
+    mission = replace(mission, trail=followed(world, mission.trail, mission.world, jnp.any(jnp.stack(runs))))
     mission, signals = decide(world, plan, mission)
     ends = first + timing.log_ticks * (1 + jnp.arange(logs))
     samples = tuple(None if s is None else replace(s, rois=None) for s in samples)  # they are in the windows
@@ -63,7 +66,7 @@ def _unpacked(record: jax.Array, tree: Any) -> Any:
 def _moving(mission: MissionState) -> MissionState:
     """The mission without what decisions alone change: a loop would copy it from pass to pass."""
     phases = tuple(replace(phase, path=None) for phase in mission.phases)
-    return replace(mission, phases=phases, phase_of=(), belief=None, windows=(), survey=None)
+    return replace(mission, phases=phases, phase_of=(), belief=None, windows=(), survey=None, trail=None)
 
 
 def _whole(mission: MissionState, moving: MissionState) -> MissionState:

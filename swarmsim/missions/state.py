@@ -7,6 +7,7 @@ import jax
 from swarmsim.estimation import Estimated, Hotspots, RadiationMap
 from swarmsim.estimation.recursive_map import Binned
 from swarmsim.estimation.windows import Windows
+from swarmsim.missions.trail import Trail
 from swarmsim.policies.path import Path
 from swarmsim.pytree import pytree
 from swarmsim.world.state import WorldState
@@ -49,6 +50,7 @@ class MissionState:
     windows: tuple[Windows | None, ...]  # for each group: what its detectors counted
     survey: Survey | None  # of the last phase that asked for the source
     over_s: jax.Array  # [] when the mission ended; inf: it has not
+    trail: Trail | None = None  # of the vehicles that carry sources, where spectra are drawn: truth, not known to it
 
 
 @pytree

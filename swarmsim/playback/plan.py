@@ -157,8 +157,16 @@ def legend_above(axes: Axes, columns: int, handles: list | None = None) -> None:
 
 
 def draw_truth(axes: Axes, record: MissionRecord) -> None:
-    """Crosses at the true sources."""
+    """Crosses at the true sources: at the centre of a line or an area with its outline, at the start of a track."""
     for k, source in enumerate(record.sources):
+        xy: NDArray[np.floating] = np.zeros((0, 2))
+        if source.corners_m is not None:
+            corners = np.asarray(source.corners_m, float)[:, :2]
+            xy = corners if source.form == "line" else np.concatenate([corners, corners[:1]])
+        elif source.carrier is not None:
+            xy = record.track_of(source)[:, :2]
+        if len(xy):
+            axes.plot(*xy.T, ":" if source.form == "carried" else "-", color=TRUTH, linewidth=1.0, zorder=7)
         axes.plot(
             *source.position_m[:2],
             linestyle="none",

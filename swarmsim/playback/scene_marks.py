@@ -6,9 +6,10 @@ from numpy.typing import NDArray
 
 from swarmsim.playback.blueprint import site_bounds
 from swarmsim.playback.colours import DRIVEN, ESTIMATE, FLOWN, TRUTH, RateScale, measured_phases, rgba, scale_name
-from swarmsim.playback.entities import TIMELINE, path_of
+from swarmsim.playback.entities import TIMELINE, path_of, times
 from swarmsim.playback.growing_map import raster_at
-from swarmsim.results.record import Estimate, MissionRecord
+from swarmsim.playback.story import extent
+from swarmsim.results.record import Estimate, MissionRecord, TrueSource
 from swarmsim.site.model import SiteModel
 
 CHI2_95_3 = 7.815  # 95 % quantile of chi-squared, 3 degrees of freedom (NIST/SEMATECH e-Handbook, table 1.3.6.7.4)
@@ -20,8 +21,7 @@ _PATH, _HOTSPOT, _LABEL = [240, 240, 240, 255], [255, 255, 255, 255], [255, 255,
 def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel) -> None:
     """Truth from the start; hotspots and the survey's estimate when they are made; the final estimate at the end."""
     for k, source in enumerate(record.sources):
-        label = f"true {source.nuclide}, {source.activity_mbq:.0f} MBq"
-        _pin(stream, f"truth/{k}", source.position_m, 7.0, label, TRUTH, static=True)
+        _send_truth(stream, f"truth/{k}", record, source)
     stream.set_time(TIMELINE, duration=float(record.surveyed_s))
     _send_hotspots(stream, record, site_model)
     for k, one in enumerate(record.survey_estimates):
@@ -35,6 +35,30 @@ def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: 
             stream.log(f"world/estimate/survey/{k}/pin", rr.Clear(recursive=True))
             stream.log(f"world/labels/estimate/survey/{k}", rr.Clear(recursive=True))
     stream.reset_time()
+
+
+def _send_truth(stream: rr.RecordingStream, path: str, record: MissionRecord, source: TrueSource) -> None:
+    """A pin: at a point, at the centre of a line or an area with its outline, or going with its vehicle."""
+    label = f"true {source.nuclide}, {source.activity_mbq:.0f} MBq"
+    if source.carrier is not None:
+        carrier = record.vehicles[source.carrier]
+        _pin(stream, path, np.zeros(3), 7.0, f"{label}, on {carrier.name}", TRUTH, static=True)
+        time_s, track = np.asarray(carrier.time_s, float), record.track_of(source)
+        if len(time_s) and time_s[0] > record.start_s:  # it waits where it will start
+            time_s, track = np.r_[record.start_s, time_s], np.concatenate([track[:1], track])
+        for entity in (f"world/{path}/pin", f"world/labels/{path}"):
+            stream.send_columns(entity, times(time_s), rr.Transform3D.columns(translation=track))
+        return
+    if source.corners_m is not None and source.points_m is not None:
+        label, corners = f"{label}, {extent(source)}", np.asarray(source.corners_m, float)
+        ring = corners if source.form == "line" else np.concatenate([corners, corners[:1]])
+        paint = [rgba(TRUTH)]
+        outline = rr.LineStrips3D([ring], colors=paint, radii=rr.Radius.ui_points(1.5))
+        stream.log(f"world/{path}/outline", outline, static=True)
+        # The outline cuts through uneven ground; the points lie on it.
+        dots = rr.Points3D(source.points_m, radii=rr.Radius.ui_points(1.5), colors=paint)
+        stream.log(f"world/{path}/points", dots, static=True)
+    _pin(stream, path, source.position_m, 7.0, label, TRUTH, static=True)
 
 
 def _send_hotspots(stream: rr.RecordingStream, record: MissionRecord, site_model: SiteModel) -> None:

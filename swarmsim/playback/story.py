@@ -5,7 +5,7 @@ import rerun as rr
 
 from swarmsim.playback.entities import BODY_SCALE, TIMELINE
 from swarmsim.playback.spectrum_figure import spectrum_title
-from swarmsim.results.record import Estimate, MissionRecord
+from swarmsim.results.record import Estimate, MissionRecord, TrueSource
 from swarmsim.world.events import FAILSAFES
 
 _LEVEL = dict.fromkeys(("crash", "obstacle", "vehicle", "non_finite"), "ERROR")
@@ -62,7 +62,7 @@ def page(record: MissionRecord) -> str:
         for v in record.vehicles
     )
     truth = "\n".join(
-        f"- true: {s.nuclide}, {s.activity_mbq:.0f} MBq at "
+        f"- true: {s.nuclide}, {s.activity_mbq:.0f} MBq {_where(record, s)} "
         f"{s.position_m[0]:.1f} m east, {s.position_m[1]:.1f} m north, {s.position_m[2]:.1f} m up"
         for s in record.sources
     )
@@ -76,6 +76,23 @@ def page(record: MissionRecord) -> str:
         f"# {record.name}\n\nSite {record.site}, seed {record.seed}\n\n**{record.finding}**{warnings}\n\n"
         f"{truth}\n{found}\n\n| vehicle | type | energy [Wh] | |\n|---|---|---|---|\n{team}\n\n{_drawn(record)}\n"
     )
+
+
+def _where(record: MissionRecord, source: TrueSource) -> str:
+    """What comes before the place of a source."""
+    if source.carrier is not None:
+        return f"on {record.vehicles[source.carrier].name}, at first at"
+    return "at" if source.form == "point" else f"over {extent(source)} round"
+
+
+def extent(source: TrueSource) -> str:
+    """The length of a line, or the area that an outline has on the map."""
+    assert source.corners_m is not None
+    xy = np.asarray(source.corners_m, float)[:, :2]
+    if source.form == "line":
+        return f"a line of {np.linalg.norm(np.diff(xy, axis=0), axis=1).sum():.3g} m"
+    x, y = xy.T
+    return f"an area of {0.5 * abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)):.3g} m2"
 
 
 def _drawn(record: MissionRecord) -> str:

@@ -20,14 +20,13 @@ from swarmsim.results.record import (
     Samples,
     Sought,
     Spectrum,
-    TrueSource,
     VehicleRecord,
 )
+from swarmsim.results.sources import true_sources
 from swarmsim.results.status import Fit, Verdict, assess
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.site.model import height_at
-from swarmsim.world.model import World
 
 LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
 """Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
@@ -73,7 +72,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         estimate=next(iter(final), None),
         further=final[1:],
         spectrum=spectrum,
-        sources=true_sources(simulation, batch.worlds.of(index)),
+        sources=true_sources(simulation, batch.worlds.of(index), vehicles),
         paths_m=_paths(simulation, end),
         events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
         finding=finding(verdict, final, spectrum, _no_way(simulation, end), _one_nuclide(simulation)),
@@ -269,19 +268,6 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         goodness=float(answer.goodness),
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
         lines_kev=np.array([line.energy_kev for line in lines]),
-    )
-
-
-def true_sources(simulation: Simulation, world: World) -> tuple[TrueSource, ...]:
-    """The sources of one mission's world, whatever values it was given; one without activity is not there."""
-    sources, names = world.sources, tuple(simulation.scenario.nuclides)
-    return tuple(
-        TrueSource(
-            nuclide=names[int(sources.nuclide[k])],
-            position_m=np.asarray(sources.position_m[k], float),
-            activity_mbq=1e-6 * float(sources.activity_bq[k]),
-        )
-        for k in np.flatnonzero(np.asarray(sources.activity_bq) > 0.0)
     )
 
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from swarmsim.missions.state import Track
 from swarmsim.pytree import pytree
-from swarmsim.results.extract import CROWDED, SAMPLE, samples_of, true_sources
+from swarmsim.results.extract import CROWDED, SAMPLE, samples_of
 from swarmsim.results.record import Event, MissionRecord, Phase, VehicleRecord
+from swarmsim.results.sources import true_sources
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.sensors.radiation import Reading
@@ -106,7 +107,7 @@ def record_steps(simulation: Simulation, frames: Frame, seed: int, world: World 
         surveyed_s=phase.end_s,
         estimate=None,
         spectrum=None,
-        sources=true_sources(simulation, simulation.world if world is None else world),
+        sources=true_sources(simulation, simulation.world if world is None else world, vehicles),
         paths_m={},
         events=tuple(_events(simulation, frames)),
         finding="stepped by hand, so nothing was estimated",

@@ -7,6 +7,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmsim.config.sources import Form
+
 Floats = NDArray[np.floating]
 Sought = Literal["nothing", "source", "nuclide"]
 """What a mission was to find; nuclide: a source with its nuclide."""
@@ -131,8 +133,23 @@ class TrueSource:
     """Ground truth of one source."""
 
     nuclide: str
-    position_m: Floats  # [3]
-    activity_mbq: float
+    position_m: Floats  # [3] of a line or an area its centre of activity, of a carried one where it was at the start
+    activity_mbq: float  # of the whole source, at the start
+    form: Form = "point"
+    points_m: Floats | None = None  # [p, 3] that a line or an area was computed as
+    corners_m: Floats | None = None  # [k, 3] of a line or an area, at its height above the terrain
+    carrier: int | None = None  # index into MissionRecord.vehicles of the vehicle that carries it
+    offset_m: Floats | None = None  # [3] in the carrier's body frame
+
+
+def carried_m(position_m: Floats, quaternion: Floats, offset_m: Floats | None) -> Floats:
+    """World places [n, 3] of a point ``offset_m`` [3] (body) from vehicles at poses [n, 3] and [n, 4]; host."""
+    place = np.asarray(position_m, float)
+    if offset_m is None:
+        return place
+    turn = np.asarray(quaternion, float)
+    twice = 2.0 * np.cross(turn[:, 1:], offset_m)
+    return place + offset_m + turn[:, :1] * twice + np.cross(turn[:, 1:], twice)
 
 
 @dataclass(frozen=True)
@@ -183,6 +200,12 @@ class MissionRecord:
     def survey_estimates(self) -> tuple[Estimate, ...]:
         """All sources by the survey's counts, the surest first."""
         return () if self.survey_estimate is None else (self.survey_estimate, *self.survey_further)
+
+    def track_of(self, source: TrueSource) -> Floats:
+        """Where a carried source was [n, 3], at the times of its carrier's track."""
+        assert source.carrier is not None
+        carrier = self.vehicles[source.carrier]
+        return carried_m(carrier.position_m, carrier.quaternion, source.offset_m)
 
     def phase(self, name: str) -> Phase | None:
         """The phase of a name; None where it did not begin."""

@@ -60,7 +60,9 @@ class Timings:
 def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
     """One mission's summary as plain JSON values; None where the mission found nothing or looked for nothing.
 
-    Errors are distances to the nearest true source: of the hotspot on the map (horizontal), of the source in space.
+    Errors are distances to the nearest true source: of the hotspot on the map (horizontal), of the source in space. A
+    line or an area counts by its centre of activity, a source on a vehicle by where it was at the start; activities are
+    those of the start.
     """
     record = record.finite()
     hotspot = _hotspot(record.map)
@@ -89,6 +91,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "drawn": dict(record.drawn),
         "true_sources": [
             {"nuclide": s.nuclide, "position_m": _plain(s.position_m), "activity_mbq": float(s.activity_mbq)}
+            | _form(record, s)
             for s in record.sources
         ],
         "vehicles": [
@@ -106,6 +109,16 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "timing": timing_summary(timings),
         "versions": versions(),
     }
+
+
+def _form(record: MissionRecord, source: TrueSource) -> dict[str, Any]:
+    """What a source that is no point at rest has besides: its form, corners, or carrier and where it came to."""
+    if source.corners_m is not None:
+        return {"form": source.form, "corners_m": np.asarray(source.corners_m, float).tolist()}
+    if source.carrier is None:
+        return {}
+    carrier, last = record.vehicles[source.carrier], record.track_of(source)[-1]
+    return {"form": source.form, "on": carrier.name, "end_position_m": _plain(last)}
 
 
 def event_summary(event: Event) -> dict[str, Any]:

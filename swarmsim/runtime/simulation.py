@@ -364,7 +364,7 @@ def _conclude(world: World, plan: Plan, carried: tuple[jax.Array, MissionState])
     key, mission = carried
     measurements = gathered(world, plan, mission.windows, key)
     known = survey(plan, *measurements) if mission.survey is None else mission.survey
-    return conclude(key, world, plan, known, *measurements)
+    return conclude(key, world, plan, known, *measurements, mission.trail)
 
 
 def _segment_of(log: Log, ran: np.ndarray, periods: int) -> Segment:

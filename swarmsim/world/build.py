@@ -19,17 +19,17 @@ from swarmsim.kept import kept
 from swarmsim.physics.multirotor import check_time_step
 from swarmsim.pytree import on_host
 from swarmsim.radiation.background import SMOOTH_M, BackgroundField
-from swarmsim.radiation.detector import AIR, Detector, Source, build_detector
+from swarmsim.radiation.detector import AIR, Detector, build_detector
 from swarmsim.radiation.library import Library
 from swarmsim.sensors.radiation import Counter, Departures
 from swarmsim.site import Site, SiteModel
 from swarmsim.site.landing_places import landing_places
-from swarmsim.site.model import height_at
 from swarmsim.site.walls import walls_of
 from swarmsim.vehicles.multirotor import multirotor_params
 from swarmsim.vehicles.skid_steer import skid_steer_params
 from swarmsim.world.failsafes import ACTIONS, HOLD, LEASH_M, FailsafeRules
 from swarmsim.world.model import Air, Group, Limits, Radio, Timing, TrafficRules, World
+from swarmsim.world.sources import build_sources
 
 NOWHERE_M = 1e6
 """Distance [m] of a fence that is never met."""
@@ -74,11 +74,13 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
     """
     mission, site = scenario.mission, site_model.site
     timing, library = build_timing(scenario), library_of(scenario)
-    radio = mission.radio
+    radio, groups = mission.radio, grouped(scenario)
+    sources, emission = build_sources(scenario, site, library, groups)
     return World(
         site=site,
         walls=walls_of(site),
-        sources=_sources(scenario, site_model, library),
+        sources=sources,
+        emission=emission,
         air=Air(
             speed_m_s=_f32(mission.wind.speed_m_s),
             from_rad=_f32(math.radians(mission.wind.from_deg)),
@@ -97,7 +99,7 @@ def build_world(scenario: Scenario, site_model: SiteModel, mates: int = 0) -> Wo
             delay=round(radio.delay_s / timing.judge_period_s),
             mates=mates,
         ),
-        groups=tuple(_group(scenario, members, timing, library) for members in grouped(scenario)),
+        groups=tuple(_group(scenario, members, timing, library) for members in groups),
         timing=timing,
         engine=mission.engine,
     )
@@ -327,14 +329,3 @@ def _exposure_ticks(scenario: Scenario, model: str, timing: Timing) -> int:
             suggestion=f"set timing.judge_period_s to {period:g} or less",
         )
     return whole
-
-
-def _sources(scenario: Scenario, site_model: SiteModel, library: Library) -> Source:
-    truths = scenario.mission.sources
-    xy = np.array([s.position_m for s in truths] or [(0.0, 0.0)], np.float64)
-    height = np.array([s.height_m for s in truths] or [0.0]) + height_at(site_model.site, xy)
-    return Source(
-        position_m=_f32(np.concatenate([xy, height[:, None]], axis=1)),
-        activity_bq=_f32([1e6 * s.activity_mbq for s in truths] or [0.0]),
-        nuclide=on_host([library.nuclide_index(s.nuclide) for s in truths] or [0], np.int32),
-    )

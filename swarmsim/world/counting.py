@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from swarmsim.sensors.radiation import count, unread
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world import events
+from swarmsim.world.emission import Poses, between, sources_at
 from swarmsim.world.model import Group, World
 from swarmsim.world.state import GroupState
 
@@ -35,6 +36,7 @@ def noted(
 def counted(
     world: World, group: Group, key: jax.Array, first: jax.Array, ticks: int, running: jax.Array,
     before: GroupState, after: GroupState, seen: tuple[RigidState, ...], branch: Callable[..., Any] = jax.lax.cond,
+    carriers: tuple[Poses | None, Poses | None] = (None, None),
 ) -> GroupState:  # fmt: skip
     """The group (axis U) ``ticks`` control periods after the one numbered ``first``, with its detectors.
 
@@ -47,6 +49,7 @@ def counted(
         before, after: the group then and now; the counter is taken from ``before``.
         seen: from `noted`.
         branch: how to compute what is not always due.
+        carriers: poses of the vehicles that carry sources, then and now.
     """
     counter, counter_state = group.counter, before.counter
     if counter is None or counter_state is None:
@@ -56,8 +59,10 @@ def counted(
     for place, body in enumerate(seen):
         tick = (first // counter.ticks + 1 + place) * counter.ticks
         due = running & (tick <= first + ticks)
+        poses = between(*carriers, (tick - first) / ticks)
+        sources = sources_at(world.sources, world.emission, tick * jnp.float32(world.timing.control_period_s), poses)
         counter_state = count(
-            counter, counter_state, body, measuring, group.member, world.site, world.sources, world.background,
+            counter, counter_state, body, measuring, group.member, world.site, sources, world.background,
             world.departures, key, tick, world.timing.control_period_s, due, branch,
         )  # fmt: skip
     return replace(after, counter=counter_state)

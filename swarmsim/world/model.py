@@ -15,6 +15,7 @@ from swarmsim.scalars import Layout
 from swarmsim.sensors.radiation import Counter, Departures
 from swarmsim.site import Site
 from swarmsim.site.walls import Walls
+from swarmsim.world.emission import Emission
 from swarmsim.world.failsafes import FailsafeRules
 
 
@@ -107,7 +108,8 @@ class World:
 
     site: Site
     walls: Walls  # of the site, for what flies
-    sources: Source  # leading axis S >= 1; a source of no activity stands in for none
+    sources: Source  # points of all sources at the start, leading axis P >= 1; one of no activity stands in for none
+    emission: Emission  # of these points: which source, decay, carriers (whose points are in their body frames)
     air: Air
     background: BackgroundField
     departures: Departures

@@ -17,8 +17,10 @@ from swarmsim.physics.wind import GUST_DRAWS, gust_noise, gust_scales, gust_star
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import counter_start
+from swarmsim.vehicles.state import RigidState
 from swarmsim.world import events
 from swarmsim.world.counting import counted, not_seen, noted
+from swarmsim.world.emission import poses_of
 from swarmsim.world.failsafes import no_rescue
 from swarmsim.world.judge import look_around, record_events
 from swarmsim.world.kinds import KINDS
@@ -109,7 +111,16 @@ def step(world: World, state: WorldState, commands: Sequence[Any], periods: int 
         state, collided = either(due, look, lambda: untouched)
     go = partial(_go, world, state, due, periods)
     full = full_commands(world, commands)
-    groups = tuple(go(number, command, hit) for number, (command, hit) in enumerate(zip(full, collided, strict=True)))
+    gone = [go(number, command, hit) for number, (command, hit) in enumerate(zip(full, collided, strict=True))]
+    poses = partial(poses_of, world.emission)
+    carriers = poses([g.vehicle.body for g in state.groups]), poses([g.vehicle.body for g, _ in gone])
+    groups = tuple(
+        counted(
+            world, group, state.key, first, periods, state.clock.running[number], state.groups[number], *gone[number],
+            branch=either, carriers=carriers,
+        )
+        for number, group in enumerate(world.groups)
+    )  # fmt: skip
     clock = replace(state.clock, tick=first + periods)
     state = replace(state, clock=clock, groups=groups)
     return state, readings_of(state)
@@ -194,8 +205,12 @@ def with_move(state: GroupState, moved: Moved) -> GroupState:
 
 def _go(
     world: World, state: WorldState, due: jax.Array, periods: int, number: int, command: Any, collided: jax.Array
-) -> GroupState:
-    """A group after control periods under one full command, each vehicle by itself; judged before them if ``due``."""
+) -> tuple[GroupState, tuple[RigidState, ...]]:
+    """A group after control periods under one full command, each vehicle by itself; judged before them if ``due``.
+
+    Its detectors are as before: what they count comes when all groups have gone. With it come the places where their
+    rates were due.
+    """
     group, before = world.groups[number], state.groups[number]
     first, running, now = state.clock.tick, state.clock.running[number], now_s(world, state)
     judged = partial(record_events, world, group.kind, now)
@@ -212,7 +227,7 @@ def _go(
         go = partial(_all_periods, group, periods, running, due, *each)
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
     after, places = go(group.params, group.limits, seen, collided, command)
-    return counted(world, group, state.key, first, periods, running, before, after, places, branch=either)
+    return after, places
 
 
 def _in_kernels() -> bool:

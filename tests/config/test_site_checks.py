@@ -12,6 +12,7 @@ from swarmsim.config.site_checks import check_site
 from swarmsim.site.model import Obstacles, Site, SiteModel, VisualMesh
 from tests.config.project import line_of, spoil
 
+LINE = "nuclide: Co-60, activity_mbq: 1, height_m: 1, line_m"
 SURVEY, FIRST = "phases.survey.settings", "phases.0.settings"
 ROUND = (
     "{name: b, who: orpheus, policy: waypoints, settings: {speed_m_s: 1, points: [[0, 30], [0, -71]]}, time_limit_s: 9}"
@@ -64,6 +65,8 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
         ("sources.0.position_m=[4.85, 3]", "sources.0.position_m", ["inside the wall of a building of brick"]),
         ("sources.0.position_m=[3, 9.85]", "sources.0.position_m", ["inside the wall of a building of brick"]),
         ("sources.0.position_m=[45, 20.2]", "sources.0.position_m", ["inside a solid obstacle of concrete"]),
+        (f"sources.0={{{LINE}: [[0, 40], [0, 75]]}}", "sources.0.line_m", ["outside the site", "[0.0, 75.0]"]),
+        (f"sources.0={{{LINE}: [[40, 10], [40, 30]]}}", "sources.0.line_m", ["2 of the 24 points of the"]),
         ("vehicles.uav1.position_m=[-85, 0]", "vehicles.0.position_m", ["'uav1' starts outside the site", "x from"]),
         ("vehicles.uav1.position_m=[0, 8]", "vehicles.0.position_m", ["'uav1' starts inside an obstacle of brick"]),
         ("vehicles.uav1.position_m=[5.2, 0]", "vehicles.0.position_m", ["or touches it", "from every obstacle"]),
@@ -89,6 +92,8 @@ def test_what_does_not_fit(mission: Path, site: SiteModel, override: str, path: 
         "sources.0.position_m=[0, 8]",  # in the hollow of the building, which is longer along y
         "sources.0.position_m=[-30, 30]",  # in the hedge
         "sources.0.position_m=[45, 22]",  # beside the wall
+        f"sources.0={{{LINE}: [[45, 22], [35, 22]]}}",  # along it
+        "sources.0={nuclide: Co-60, activity_mbq: 1, on: uav1}",
         "sources.0={nuclide: Co-60, position_m: [45, 20], height_m: 4.5, activity_mbq: 1}",  # on top of the wall
         "vehicles.uav1.position_m=[8, 0]",  # beside the building
         f"{SURVEY}.area_m=[[0, 0], [12, 0], [12, 60], [0, 60]]",  # one line and a bit

@@ -278,6 +278,8 @@ def test_values_in_the_stead_of_a_family_make_a_single_scenario(standing):
         ("sources.0.height_m", "{place: {region: open}}", "is for sources.*.position_m"),
         ("sources.0.position_m", "{place: {region: opn}}", "not one of the choices"),
         ("sources.0.position_m", "{place: {region: indoors, margin_m: 900}}", "no place in the region 'indoors'"),
+        ("sources.0.on", "{choice: [uav1, uav2]}", "position_m and on are given"),
+        ("sources.0.offset_m.2", "{uniform: [0, 1]}", "sources.0.offset_m"),
         ("vehicles.uav1.name", "{choice: [a, b]}", "sources.*.nuclide, position_m"),
         ("vehicles.uav1.type", "{choice: [x500, tarot_t650]}", "cannot be varied"),
         ("engine", "{choice: [mjx, analytic]}", "cannot be varied"),
@@ -303,6 +305,34 @@ def test_no_room_for_sources_and_parts_varied_twice_are_told():
         swarmsim.load("recon", twice)
     with pytest.raises(swarmsim.InputError, match="setting it changes nothing"):
         swarmsim.load("random_recon", ["sources.1.activity_mbq=5"])
+
+
+LINE_SOURCE = "{nuclide: Cs-137, line_m: [[-10, -30], [10, -30]], height_m: 0, activity_mbq: 50}"
+
+
+def test_lines_and_carriers_are_values_as_long_as_the_number_of_points_stays():
+    moved = "vary.sources.0.line_m={choice: [[[-10, -30], [10, -30]], [[0, -30], [0, -10]]]}"
+    driven = "vary.sources.1.on={choice: [orpheus, uav1]}"
+    carried = "{nuclide: F-18, on: uav2, activity_mbq: 5}"
+    built = swarmsim.build(
+        swarmsim.load("recon", [f"sources=[{LINE_SOURCE}, {carried}]", moved, driven, "engine=analytic"])
+    )
+    built.check_family()
+    worlds = [built.world_of(seed) for seed in range(12)]
+    assert {int(world.emission.carrier[0]) for world in worlds} == {0, 3}
+    assert {float(np.ptp(world.sources.position_m[:-1, 0])) > 1.0 for world in worlds} == {True, False}
+    longer = "vary.sources.0.line_m={choice: [[[-10, -30], [10, -30]], [[0, -30], [9, -30]]]}"
+    with pytest.raises(swarmsim.InputError, match="changes more than a value"):
+        swarmsim.build(swarmsim.load("recon", [f"sources=[{LINE_SOURCE}]", longer, "engine=analytic"])).check_family()
+
+
+def test_a_source_that_is_placed_keeps_away_from_lines():
+    placed = "vary.sources.1.position_m={place: {region: open, apart_m: 20}}"
+    point = "{nuclide: F-18, position_m: [0, 0], height_m: 1, activity_mbq: 5}"
+    built = swarmsim.build(swarmsim.load("recon", [f"sources=[{LINE_SOURCE}, {point}]", placed, "engine=analytic"]))
+    xy = np.array(built.draw(range(60)).values["sources.1.position_m"])
+    away = np.hypot(np.maximum(np.abs(xy[:, 0]) - 10.0, 0.0), xy[:, 1] + 30.0)
+    assert 20.0 <= away.min() + 0.5 < 30.0  # points stand half a metre from the ends of the line
 
 
 def test_a_source_drawn_into_a_wall_is_told_with_its_seed():

@@ -14,6 +14,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 
 from swarmsim.playback import figures, plan
+from swarmsim.playback.colours import TRUTH
 from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 from tests import synthetic
@@ -222,3 +223,13 @@ def test_figures_of_phases_with_any_name(found: MissionRecord) -> None:
     samples = dataclasses.replace(found.samples, phase=np.full(len(found.samples.time_s), phase.name))
     record = dataclasses.replace(found, phases=(phase,), samples=samples)
     assert "measurements_by_hand_1" in figures.figures_of(record)
+
+
+def test_lines_areas_and_tracks_of_sources_are_drawn(found: MissionRecord, site: SiteModel) -> None:
+    record = synthetic.forms(found)
+    axes = figures.trajectories(record, site).axes[0]
+    drawn = [line.get_xydata() for line in axes.lines if line.get_color() == TRUTH and line.get_label()[0] == "_"]
+    drawn = [each for each in drawn if len(each) > 1]  # the others are crosses
+    assert [len(each) for each in drawn] == [2, 5, len(record.vehicles[3].time_s)]
+    np.testing.assert_allclose(drawn[2], record.track_of(record.sources[2])[:, :2])
+    assert labels(axes).count("true source") == 1

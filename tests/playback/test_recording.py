@@ -12,6 +12,7 @@ import pytest
 import rerun as rr
 
 from swarmsim.playback.recording import write_recording
+from swarmsim.playback.story import page as summary_page
 from swarmsim.results.record import Event, MissionRecord, Samples
 from swarmsim.site.model import SiteModel
 from tests import synthetic
@@ -358,3 +359,33 @@ def test_rerun_errors_are_raised_and_the_global_mode_is_left_alone(site: SiteMod
     with pytest.raises(Exception, match=r"."):
         write_recording(synthetic.mission(), site, tmp_path / "no" / "such" / "folder" / "mission.rrd")
     assert rr.strict_mode() == before
+
+
+def test_lines_and_areas_have_outlines_and_a_carried_source_moves(
+    found: MissionRecord, site: SiteModel, tmp_path: Path
+) -> None:
+    record = synthetic.forms(found)
+    write_recording(record, site, tmp_path / "forms.rrd")
+    assert verify(tmp_path / "forms.rrd").returncode == 0
+    made = Recording(tmp_path / "forms.rrd")
+    for k, closed in ((0, False), (1, True)):
+        when, ((strip,),) = made.rows(f"/world/truth/{k}/outline", "LineStrips3D:strips")
+        assert np.isnan(when).all()
+        corners = np.asarray(record.sources[k].corners_m)
+        np.testing.assert_allclose(strip, [*corners, corners[0]] if closed else corners, atol=1e-4)
+        _, (points,) = made.rows(f"/world/truth/{k}/points", "Points3D:positions")
+        np.testing.assert_allclose(points, np.asarray(record.sources[k].points_m), atol=1e-4)
+    _, (label,) = made.rows("/world/labels/truth/0", "Points3D:labels")
+    assert label == ["true Cs-137, 300 MBq, a line of 20 m"]
+    _, (label,) = made.rows("/world/labels/truth/1", "Points3D:labels")
+    assert label == ["true I-131, 500 MBq, an area of 80 m2"]
+    for entity in ("/world/truth/2/pin", "/world/labels/truth/2"):
+        when, places = made.rows(entity, "Transform3D:translation")
+        track = record.track_of(record.sources[2])
+        times = record.vehicles[3].time_s
+        expected = np.stack([np.interp(when, times, track[:, k]) for k in range(3)], -1)
+        np.testing.assert_allclose(np.array(places)[:, 0], expected, atol=1e-3)
+        assert when[0] <= record.phases[0].start_s
+    page = summary_page(record)
+    assert "300 MBq over a line of 20 m round -10.0 m east" in page
+    assert f"100 MBq on {record.vehicles[3].name}, at first at" in page

@@ -259,3 +259,23 @@ def test_rows_are_flat_and_alike(found: MissionRecord, nothing: MissionRecord) -
 
 def test_no_time_no_factor(found: MissionRecord) -> None:
     assert real_time_factor([found], Timings(compile_s=0.0, run_s=0.0)) is None
+
+
+def test_lines_areas_and_carried_sources_are_told_as_what_they_are(found: MissionRecord) -> None:
+    record = synthetic.forms(found)
+    line, area, carried = json.loads(json.dumps(summary(record, TIMINGS)["true_sources"]))
+    assert (line["form"], line["position_m"]) == ("line", [-10.0, -30.0, 1.0])
+    assert line["corners_m"] == [[-20.0, -30.0, 1.0], [0.0, -30.0, 1.0]]
+    assert (area["form"], len(area["corners_m"])) == ("area", 4)
+    rover = record.vehicles[3]
+    assert (carried["form"], carried["on"], carried["activity_mbq"]) == ("carried", rover.name, 100.0)
+    assert carried["position_m"] == pytest.approx(list(record.track_of(record.sources[2])[0]))
+    np.testing.assert_allclose(
+        np.linalg.norm(record.track_of(record.sources[2]) - rover.position_m, axis=1), np.hypot(0.5, 0.2)
+    )
+    forward = np.array(carried["end_position_m"]) - rover.position_m[-1]
+    w, x, y, z = rover.quaternion[-1]
+    assert np.arctan2(forward[1], forward[0]) == pytest.approx(
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), abs=0.02
+    )
+    assert "form" not in summary(found, TIMINGS)["true_sources"][0]
