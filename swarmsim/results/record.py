@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.floating]
+Window = tuple[float, float]
+"""Lower and upper end in keV of an energy window."""
 Sought = Literal["nothing", "source", "nuclide"]
 """What a mission was to find; nuclide: a source with its nuclide."""
 
@@ -68,10 +70,17 @@ class Samples:
     counts: Floats  # [n]
     exposure_s: Floats  # [n] live interval that the counts stand for
     count_rate_cps: Floats  # [n] counts / exposure
+    axis: Floats | None = None  # [n, 3] unit vector along the crystal, mean, world; None, as all below: not recorded
+    windows: Floats | None = None  # [n, W] counts by `MissionRecord.windows_kev`, nan: not of this detector
+    live_s: Floats | None = None  # [n] part of the exposure in which the detector was not dead, by its law
+    dose_rate_usv_h: Floats | None = None  # [n] H*(10) by the counts (`DoseOperator`), natural background included
+    dose_rate_std_usv_h: Floats | None = None  # [n] its standard deviation by counting statistics
+    kerma_rate_ugy_h: Floats | None = None  # [n] air kerma rate by the counts
 
     def rows(self, index: NDArray[Any] | slice) -> "Samples":
         """Those that ``index`` chooses, in its order."""
-        return Samples(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
+        columns: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return replace(self, **{name: each[index] for name, each in columns.items() if each is not None})
 
     def of_phase(self, phase: str) -> "Samples":
         """Those of one phase."""
@@ -136,6 +145,14 @@ class TrueSource:
 
 
 @dataclass(frozen=True)
+class GammaConstant:
+    """Dose rates 1 m from a source of 1 MBq with nothing around it."""
+
+    ambient_usv_h: float  # ambient dose equivalent H*(10)
+    kerma_ugy_h: float  # air kerma
+
+
+@dataclass(frozen=True)
 class Phase:
     """A phase of the mission: who was in it, and its simulated time span."""
 
@@ -173,6 +190,8 @@ class MissionRecord:
     survey_further: tuple[Estimate, ...] = ()  # further sources by the survey's counts
     further: tuple[Estimate, ...] = ()  # further sources by all counts
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
+    windows_kev: tuple[Window, ...] = ()  # energy windows of all detectors, lowest first
+    at_1_m: Mapping[str, GammaConstant] = field(default_factory=dict)  # by nuclide, of those found and the true ones
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:
