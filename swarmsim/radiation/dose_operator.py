@@ -27,6 +27,7 @@ LOWEST_KEV, HIGHEST_KEV = 60.0, 2700.0
 """Energies for which the operator is made; a detector's channels may end before."""
 _ENERGIES = 48
 _EVEN = np.array([1.0, 1 / 2, np.pi / 4, 1 / 3, 1 / 3])  # mean over all directions of cylinder.direction_basis
+_LEAST_SHARE = 1e-3  # of a saturated non-paralyzable detector
 _NODES = 4096  # of the inverse of the dead time law
 
 
@@ -54,10 +55,7 @@ class DoseOperator:
 
     def rates(self, counts: Floats, exposure_s: Floats) -> DoseRates:
         """Dose rates from ``counts`` [n, R] of exposures [n]; those of a saturated detector are lower bounds."""
-        total = np.asarray(counts, float).sum(axis=1)
-        observed = total / exposure_s
-        share = observed / np.maximum(self._true_rate(observed), 1e-30)
-        live = exposure_s * np.where(total > 0.0, share, 1.0)
+        live = exposure_s * self._live_share(np.asarray(counts, float).sum(axis=1) / exposure_s)
         return DoseRates(
             live_s=live,
             ambient_usv_h=counts @ self.ambient / live,
@@ -65,13 +63,14 @@ class DoseOperator:
             kerma_ugy_h=counts @ self.kerma / live,
         )
 
-    def _true_rate(self, observed_cps: Floats) -> Floats:
-        """The true rate [n] that shows as ``observed_cps`` [n] (`swarmsim.radiation.rate.registered_share`)."""
+    def _live_share(self, observed_cps: Floats) -> Floats:
+        """Share [n] of the true counts that is registered where ``observed_cps`` [n] are: `registered_share` there."""
         paralyzable, non_paralyzable = self.paralyzable_s, self.non_paralyzable_s
         if paralyzable <= 0.0:
-            return np.asarray(observed_cps / np.maximum(1.0 - observed_cps * non_paralyzable, 1e-3))
+            return np.asarray(np.maximum(1.0 - observed_cps * non_paralyzable, _LEAST_SHARE))
         true = saturating_rate(paralyzable, non_paralyzable) * np.linspace(0.0, 1.0, _NODES) ** 2
-        return np.interp(observed_cps, true * np.exp(-true * paralyzable) / (1.0 + true * non_paralyzable), true)
+        share = np.exp(-true * paralyzable) / (1.0 + true * non_paralyzable)
+        return np.interp(observed_cps, true * share, share)
 
 
 def dose_operator(spec: DetectorSpec, library: Library, kind: str) -> DoseOperator:

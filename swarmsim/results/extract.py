@@ -29,6 +29,7 @@ from swarmsim.results.status import Fit, Verdict, assess
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.site.model import height_at
+from swarmsim.world.build import detector_models
 from swarmsim.world.model import World
 
 LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
@@ -234,7 +235,8 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
     answer = conclusion.identification
     if answer is None or float(conclusion.spectrum.live_s) <= 0.0:
         return None
-    detector, names = simulation.plan.detectors[simulation.plan.spectrometer], _nuclides(simulation)
+    model, names = simulation.plan.spectrometer, _nuclides(simulation)
+    detector = simulation.plan.detectors[model]
     live, index = float(conclusion.spectrum.live_s), int(answer.nuclide)
     lines = simulation.scenario.nuclides[names[index]].lines if index >= 0 else ()
     return Spectrum(
@@ -249,6 +251,7 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         goodness=float(answer.goodness),
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
         lines_kev=np.array([line.energy_kev for line in lines]),
+        detector=detector_models(simulation.scenario)[model],
     )
 
 

@@ -133,6 +133,7 @@ class Spectrum:
     lines_kev: Floats = field(default_factory=lambda: np.zeros(0))  # [l] gamma lines of the named nuclide, for labels
     unknown: float = 0.0  # probability of a source that no nuclides of the library explain
     goodness: float = 1.0  # p-value of the deviance of the fit
+    detector: str = ""  # model that took it
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmsim.config.errors import InputError
+from swarmsim.config.names import one_of
 from swarmsim.missions.knowledge import expected_spectrum
 from swarmsim.radiation.detector import region_of
-from swarmsim.results.record import Floats, MissionRecord, Samples, Window
+from swarmsim.results.counted import Counted
+from swarmsim.results.record import Floats, Samples
 from swarmsim.results.tracks import place_of
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.world.model import World
@@ -28,36 +30,23 @@ class SampleSpectra:
     counts: NDArray[np.int32]  # [n, channels]
 
 
-def sample_spectra(
-    simulation: Simulation, record: MissionRecord, vehicle: str, world: World | None = None
-) -> SampleSpectra:
+def sample_spectra(simulation: Simulation, counted: Counted, vehicle: str, world: World | None = None) -> SampleSpectra:
     """A spectrum for each sample of ``vehicle``: the counts of each energy window, distributed over its channels.
 
     The counts of a window fall on its channels by a multinomial distribution in proportion to the expected spectrum at
-    the sample's mean place. Given the expected spectrum, Poisson counts are distributed so; the sums over each window
-    are those recorded. The draw depends on the mission's seed and the vehicle only.
+    the sample's mean place. Poisson counts with a given sum are distributed so; the sums over each window are those
+    recorded. The draw depends on the mission's seed and the vehicle only.
 
     Args:
         simulation: that flew the mission.
-        record: of the mission.
+        counted: its `MissionRecord`, or what `read_counts` found in a run directory.
         vehicle: name of a vehicle with a spectrometer.
         world: the mission's, if it was flown with other values than its seed's own.
 
     Raises:
         InputError: no such vehicle, or its detector resolves no energies.
     """
-    return drawn_spectra(simulation, record.seed, record.samples, record.windows_kev, vehicle, world)
-
-
-def drawn_spectra(
-    simulation: Simulation,
-    seed: int,
-    samples: Samples,
-    windows_kev: tuple[Window, ...],
-    vehicle: str,
-    world: World | None = None,
-) -> SampleSpectra:
-    """As `sample_spectra`, from the samples of all vehicles of the mission ``seed`` and their energy windows."""
+    samples, seed = counted.samples, counted.seed
     number = _number(simulation, vehicle)
     spec = simulation.scenario.vehicles[number].detector
     analyser = None if spec is None else simulation.scenario.detectors[spec.model].spectrometer
@@ -66,22 +55,22 @@ def drawn_spectra(
         raise InputError.of("has no spectrometer, so that there are no spectra of its samples", given=vehicle)
     edges = np.linspace(0.0, analyser.energy_max_kev, analyser.channels + 1)
     region = region_of(0.5 * (edges[1:] + edges[:-1]), analyser.rois_kev)
-    columns = [windows_kev.index(w) for w in zip(analyser.rois_kev, analyser.rois_kev[1:], strict=False)]
-    counted = np.asarray(own.windows[:, columns], np.int64)
+    columns = [counted.windows_kev.index(w) for w in zip(analyser.rois_kev, analyser.rois_kev[1:], strict=False)]
+    recorded = np.asarray(own.windows[:, columns], np.int64)
     expected = _expected(simulation.world_of(seed) if world is None else world, simulation, seed, number)
     rng = np.random.default_rng([seed, number])
-    counts = np.zeros((len(counted), analyser.channels), np.int32)
-    for first in range(0, len(counted), _BLOCK):
+    counts = np.zeros((len(recorded), analyser.channels), np.int32)
+    for first in range(0, len(recorded), _BLOCK):
         rows = slice(first, first + _BLOCK)
         mean = expected(own.position_m[rows], own.axis[rows])
-        counts[rows] = _distributed(rng, mean, counted[rows], region)
+        counts[rows] = _distributed(rng, mean, recorded[rows], region)
     return SampleSpectra(samples=own, edge_kev=edges, counts=counts)
 
 
 def _number(simulation: Simulation, vehicle: str) -> int:
     names = [member.name for member in simulation.scenario.members]
     if vehicle not in names:
-        raise InputError.of("there is no such vehicle", given=vehicle, allowed="one of " + ", ".join(names))
+        raise InputError.of("there is no such vehicle", given=vehicle, allowed=one_of(names))
     return names.index(vehicle)
 
 

@@ -1,5 +1,6 @@
 """Tables of a run directory: units in the names of columns, what they mean in the schema's metadata."""
 
+import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,8 @@ from swarmsim.results.summary import all_keys
 
 AXES = ("east", "north", "up")
 DOSES = ("live_s", "dose_rate_usv_h", "dose_rate_std_usv_h", "kerma_rate_ugy_h")
+WINDOWS_KEY = "windows_kev"
+"""Metadata of the measurements: lower and upper ends of the energy windows, as JSON."""
 _FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x y z, body (forward left up) to world"
 _MEASURED = (
     "detector samples; position is the crystal's (mean of the count), time the end of a count; counts_A_B_kev are the "
@@ -46,7 +49,8 @@ def measurements_table(record: MissionRecord) -> pa.Table:
         "exposure_s": samples.exposure_s.astype(np.float32),
         "count_rate_cps": samples.count_rate_cps.astype(np.float32),
     } | _instrument_columns(record)
-    return pa.table(columns, metadata=_metadata(record, _MEASURED))
+    told = {WINDOWS_KEY: json.dumps(record.windows_kev)} if samples.windows is not None else {}
+    return pa.table(columns, metadata=_metadata(record, _MEASURED) | told)
 
 
 def _instrument_columns(record: MissionRecord) -> dict[str, Any]:
@@ -81,6 +85,7 @@ def spectrum_table(record: MissionRecord, spectrum: Spectrum) -> pa.Table:
     }
     told = {
         "live_time_s": repr(float(spectrum.live_time_s)),
+        "detector": spectrum.detector,
         "nuclide": spectrum.nuclide,
         "confidence": repr(float(spectrum.confidence)),
     }
