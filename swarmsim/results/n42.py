@@ -39,6 +39,7 @@ _DOSE = (
     "Dose rates are ambient dose equivalent rates derived from the counts by energy window (of a counter without "
     "energy resolution: from its counts, calibrated to Cs-137), background included."
 )
+_NO_SPECTRA = "The detector resolves no energies: there are counts alone, and no spectra."
 _SPECTRA = "Spectra of samples were drawn after the flight: their sums over the energy windows are the counts recorded."
 
 
@@ -132,12 +133,12 @@ def _write_vehicle(
     spectra = None if spec.spectrometer is None else sample_spectra(simulation, counted, name, world)
     samples = counted.samples.rows(counted.samples.vehicle == number) if spectra is None else spectra.samples
     meaning, located = places_of(simulation.site_model.report)
-    remarks = [meaning, _DOSE] if spectra is None else [meaning, _DOSE, _SPECTRA]
-    model = f"{simulation.scenario.members[number].type} with {spec.name}"
+    remarks = [meaning, _DOSE, _NO_SPECTRA if spectra is None else _SPECTRA]
+    vehicle = simulation.scenario.members[number].type
     uuid = _uuid(counted.name, counted.seed, name, start, samples.time_s, samples.position_m, samples.counts)
     with n42.document(path, uuid) as file:
         n42.write(file, _heading(counted, start, remarks))
-        n42.write(file, [n42.instrument(name, model, _version()), *n42.detector(spec)])
+        n42.write(file, [n42.instrument(name, vehicle, f"{vehicle} with {spec.name}", _version()), *n42.detector(spec)])
         n42.write(file, _measurements(samples, spectra, located(samples.position_m), counted, spec, start))
         if spectra is not None:
             n42.write(file, [_sum(spectra, start)])
@@ -198,7 +199,9 @@ def _write_spectrum(simulation: Simulation, counted: Counted, spectrum: Spectrum
     begin = n42.moment(start, 0.0)
     with n42.document(path, _uuid(counted.name, counted.seed, SPECTRUM, start, spectrum.counts)) as file:
         n42.write(file, _heading(counted, start, [remark]))
-        n42.write(file, [n42.instrument("team", f"all vehicles with {spec.name}", _version()), *n42.detector(spec)])
+        n42.write(
+            file, [n42.instrument("team", spec.name, f"all vehicles with {spec.name}", _version()), *n42.detector(spec)]
+        )
         taken = [n42.spectrum("near-S", live, n42.channel_data(spectrum.counts))]
         n42.write(file, [n42.measurement("RadMeasurement", "near", "Foreground", begin, live, taken)])
         natural = [n42.spectrum("background-S", live, background)]

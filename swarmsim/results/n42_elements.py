@@ -107,8 +107,8 @@ def heading(remarks: Iterable[str], version: str) -> list[Element]:
     ]
 
 
-def instrument(identifier: str, model: str, version: str) -> Element:
-    """A vehicle with its detector."""
+def instrument(identifier: str, model: str, description: str, version: str) -> Element:
+    """A vehicle with its detector. The schema's names may have one word at most with other than letters and digits."""
     software = element(
         "RadInstrumentVersion",
         element("RadInstrumentComponentName", "Software"),
@@ -119,6 +119,7 @@ def instrument(identifier: str, model: str, version: str) -> Element:
         element("RadInstrumentManufacturerName", "simulated by swarmsim"),
         element("RadInstrumentIdentifier", identifier),
         element("RadInstrumentModelName", model),
+        element("RadInstrumentDescription", description),
         element("RadInstrumentClassCode", "Mobile System"),
         software,
         id=INSTRUMENT,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from datetime import datetime
 from itertools import pairwise
@@ -69,6 +70,8 @@ ORDER = {
     "NuclideAnalysisResults": "Nuclide*",
     "Nuclide": "NuclideIdentifiedIndicator NuclideName NuclideIDConfidenceValue",
 }
+NAME = r"([^\W_]| )*\S+([^\W_]| )*"
+"""The schema's NonBlankStringSimpleType."""
 FREE = {"RadMeasurement", "DerivedData", "EnergyCalibration", "FWHMCalibration", "EnergyWindows", "AnalysisResults"}
 
 
@@ -232,6 +235,8 @@ def test_documents_follow_the_schema(documents: dict[str, ElementTree.Element]) 
                 assert set(children[first:]) <= FREE
                 children = children[:first]
             check_order(tag, children)
+            if tag.endswith(("Name", "Identifier", "Version")) and not children:
+                assert re.fullmatch(NAME, element.text), element.text
             for name, value in element.attrib.items():
                 if name.endswith(("Reference", "References")):
                     assert set(value.split()) <= set(identifiers)
