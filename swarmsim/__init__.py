@@ -50,10 +50,13 @@ if TYPE_CHECKING:
     )
     from swarmsim.policies.registry import register as register_policy
     from swarmsim.policies.view import Task, View
+    from swarmsim.results.counted import read_counts
     from swarmsim.results.extract import mission_record
     from swarmsim.results.hand_stepped import Frame, observe, record_steps
+    from swarmsim.results.n42 import write_n42
     from swarmsim.results.record import MissionRecord
     from swarmsim.results.run_directory import write_run
+    from swarmsim.results.spectra import sample_spectra
     from swarmsim.runtime.devices import use_all_cores
     from swarmsim.runtime.run import build, run
     from swarmsim.runtime.simulation import MissionBatch, Simulation
@@ -78,10 +81,13 @@ _HOMES = {
     ),
     "policies.registry": ("register",),
     "policies.view": ("Task", "View"),
+    "results.counted": ("read_counts",),
     "results.extract": ("mission_record",),
     "results.hand_stepped": ("Frame", "observe", "record_steps"),
+    "results.n42": ("write_n42",),
     "results.record": ("MissionRecord",),
     "results.run_directory": ("write_run",),
+    "results.spectra": ("sample_spectra",),
     "runtime.devices": ("use_all_cores",),
     "runtime.run": ("build", "run"),
     "runtime.simulation": ("MissionBatch", "Simulation"),
@@ -118,12 +124,15 @@ __all__ = [
     "mission_axes",
     "mission_record",
     "observe",
+    "read_counts",
     "record_steps",
     "register_policy",
     "reset",
     "run",
+    "sample_spectra",
     "step",
     "use_all_cores",
+    "write_n42",
     "write_run",
 ]
 

@@ -5,6 +5,7 @@ import gc
 import os
 import sys
 from collections.abc import Sequence
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -332,6 +333,41 @@ def import_site(
         "plane": None if plane is None else {"margin_m": plane},
     }
     import_site_file(file, out, given, overrides, name, cell, licence, guess, force)
+
+
+@command(name="export-n42")
+def export_n42(
+    run: Path,
+    *,
+    out: Path | None = None,
+    vehicles: Annotated[tuple[str, ...], Parameter(name="--vehicle", consume_multiple=False)] = (),
+    start: datetime | None = None,
+    force: bool = False,
+) -> None:
+    """Write what a run's detectors measured as ANSI N42.42-2012 documents, with a spectrum for every sample.
+
+    For example:
+        swarmsim export-n42 runs/recon
+        swarmsim export-n42 runs/recon --vehicle orpheus --out orpheus_n42
+        swarmsim export-n42 runs/recon --start 2026-05-04T09:30:00
+
+    Parameters
+    ----------
+    run
+        Folder of a run; of a batch its first mission is written.
+    out
+        Folder of the documents, one for each vehicle and one for the spectrum near the source; RUN/n42 by default. It
+        must not exist, unless --force is given.
+    vehicles
+        Write the samples of this vehicle only; may be given again and again.
+    start
+        Date and time in UTC at which the mission began; 2000-01-01T00:00:00 by default.
+    force
+        Replace an earlier export.
+    """
+    from swarmsim.cli.export import export_run
+
+    export_run(run, out, vehicles, start, force)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -30,6 +30,9 @@ _FOUND_ROWS = (
     ("Source error", "source.error_m", "m"),
     ("Activity", "source.activity_mbq", "MBq"),
     ("Activity error", "source.activity_error_percent", "%"),
+    ("Dose rate 1 m from the source", "source.dose_rate_1m_usv_h", "uSv/h"),
+    ("Dose rate, standard deviation", "source.dose_rate_1m_std_usv_h", "uSv/h"),
+    ("Greatest dose rate, by counts", "dose_rate.greatest_usv_h", "uSv/h"),
     ("Nuclide", "nuclide.name", ""),
     ("Confidence", "nuclide.confidence", ""),
 )

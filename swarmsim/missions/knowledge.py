@@ -1,5 +1,6 @@
 """From one mission's counts to what it knows: map, hotspots, estimate, the nuclide."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax
@@ -21,7 +22,7 @@ from swarmsim.missions.state import Survey
 from swarmsim.missions.trail import Trail, poses_at
 from swarmsim.pytree import pytree
 from swarmsim.radiation.background import background_factor
-from swarmsim.radiation.detector import Source
+from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
@@ -139,14 +140,41 @@ def accumulate_spectrum(
     The sum of the samples' Poisson spectra is drawn at once, as a Poisson spectrum of the summed mean. The analyser has
     its own draw: its total differs from the counter's by statistics, as it would with a dead time of its own.
     """
-    site, background, departures = world.site, world.background, world.departures
-    detector = next(g.counter for g in world.groups if g.counter is not None and g.counter.index == model).detector
-    lengths, sensitivity = length_factors(departures, key), sensitivity_factor(departures, key, model)
+    detector = detector_of(world, model)
     # an idealised counter draws counts that stand for one second, whatever its period is
     per_exposure = detector.sample_period_s if detector.kind == "paper_ideal" else jnp.ones(())
     live = jnp.where(used, samples.exposure_s * per_exposure, 0.0)
+    expected = expected_spectrum(key, world, model, trail)
 
-    def one(position: jax.Array, axis: jax.Array, time_s: jax.Array) -> jax.Array:
+    def add(total: jax.Array, sample: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
+        position, axis, middle_s, live = sample
+        rate = jax.lax.cond(live > 0.0, expected, lambda *_: jnp.zeros_like(total), position, axis, middle_s)
+        return total + live * rate, None
+
+    start = jnp.zeros_like(detector.background_spectrum)
+    mean = jax.lax.scan(add, start, (samples.position_m, samples.axis, samples.time_s - 0.5 * live, live))[0]
+    keys = jax.random.split(randomness.consumer(key, "spectrum"), mean.shape[0])
+    return Accumulated(counts=jax.vmap(poisson)(keys, mean), live_s=jnp.sum(live))
+
+
+def detector_of(world: World, model: int) -> Detector:
+    """Detector model number ``model`` of the mission."""
+    return next(g.counter for g in world.groups if g.counter is not None and g.counter.index == model).detector
+
+
+def expected_spectrum(
+    key: jax.Array, world: World, model: int, trail: Trail | None = None
+) -> Callable[[jax.Array, jax.Array, jax.Array], jax.Array]:
+    """What detector ``model`` is to count per second in each channel [channels], by place [3], axis [3] and time [].
+
+    In the mission of ``key``; without dead time, background included. Without a ``trail`` carried sources are where
+    they began.
+    """
+    site, background, departures = world.site, world.background, world.departures
+    detector = detector_of(world, model)
+    lengths, sensitivity = length_factors(departures, key), sensitivity_factor(departures, key, model)
+
+    def expected(position: jax.Array, axis: jax.Array, time_s: jax.Array) -> jax.Array:
         sources = sources_at(world.sources, world.emission, time_s, poses_at(trail, time_s))
 
         def of_source(source: Source) -> jax.Array:
@@ -157,12 +185,4 @@ def accumulate_spectrum(
         natural = background_factor(background, site, key, position, detector.background_height_m)
         return jnp.sum(jax.vmap(of_source)(sources), axis=0) + natural * detector.background_spectrum
 
-    def add(total: jax.Array, sample: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
-        position, axis, middle_s, live = sample
-        counted = jax.lax.cond(live > 0.0, lambda: live * one(position, axis, middle_s), lambda: jnp.zeros_like(total))
-        return total + counted, None
-
-    start = jnp.zeros_like(detector.background_spectrum)
-    mean = jax.lax.scan(add, start, (samples.position_m, samples.axis, samples.time_s - 0.5 * live, live))[0]
-    keys = jax.random.split(randomness.consumer(key, "spectrum"), mean.shape[0])
-    return Accumulated(counts=jax.vmap(poisson)(keys, mean), live_s=jnp.sum(live))
+    return expected

@@ -13,8 +13,9 @@ from swarmsim.missions.frame import frame
 from swarmsim.missions.plan import Phase, Plan, Trigger
 from swarmsim.missions.state import NO_PHASE, Log, MissionState, PhaseState, Sampled, Signals, Track
 from swarmsim.missions.trail import followed
+from swarmsim.sensors.radiation import Counter
 from swarmsim.world import events
-from swarmsim.world.model import World
+from swarmsim.world.model import Timing, World
 from swarmsim.world.state import moving, now_s
 
 
@@ -43,7 +44,10 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     mission = replace(mission, trail=followed(world, mission.trail, mission.world, jnp.any(jnp.stack(runs))))
     mission, signals = decide(world, plan, mission)
     ends = first + timing.log_ticks * (1 + jnp.arange(logs))
-    samples = tuple(None if s is None else replace(s, rois=None) for s in samples)  # they are in the windows
+    samples = tuple(
+        None if s is None or g.counter is None else _ended_within(s, g.counter, world.timing, first)
+        for s, g in zip(samples, world.groups, strict=True)
+    )
     return mission, Log(time_s=ends * period_s, tracks=tracks, samples=samples), signals
 
 
@@ -109,6 +113,21 @@ def _samples(mission: MissionState, after_s: jax.Array) -> tuple[Sampled | None,
             )
         )
     return tuple(found)
+
+
+def _ended_within(sampled: Sampled, counter: Counter, timing: Timing, first: jax.Array) -> Sampled:
+    """The rows of a segment, which began after control period ``first`` [], in which exposures ended: E of the F.
+
+    All counters of a group end their exposures together, after whole multiples of the exposure, so that the log needs
+    no rows for the judging periods between.
+    """
+    exposure = counter.ticks * counter.evaluations
+    at_most = -(-timing.decision_ticks // exposure)
+    ends = (first // exposure + 1 + jnp.arange(at_most)) * exposure - first  # control periods into the segment, from 1
+    rows = (ends - 1) // timing.judge_ticks
+    inside = ends <= timing.decision_ticks
+    kept = jax.tree.map(lambda x: jnp.take(x, rows, axis=0, mode="clip"), sampled)
+    return replace(kept, new=kept.new & inside[:, None])
 
 
 def _learned(world: World, plan: Plan, mission: MissionState, samples: tuple[Sampled | None, ...]) -> MissionState:

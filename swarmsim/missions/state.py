@@ -76,7 +76,7 @@ class Track:
 
 @pytree
 class Sampled:
-    """Exposures of one group that ended in each judging period; axes [F, U]."""
+    """Exposures of one group that ended in each judging period; axes [F, U], in the log [E, U] with E <= F."""
 
     time_s: jax.Array  # [F, U] end of the exposure
     position_m: jax.Array  # [F, U, 3] of the crystal, world
@@ -84,7 +84,7 @@ class Sampled:
     axis: jax.Array  # [F, U, 3]
     counts: jax.Array  # [F, U]
     exposure_s: jax.Array  # [F, U]
-    rois: jax.Array | None  # [F, U, R] counts by region of interest; not kept in the log
+    rois: jax.Array  # [F, U, R] counts by region of interest
     new: jax.Array  # [F, U] bool: one ended in this period, and it is valid
 
 

@@ -83,7 +83,7 @@ class Detector:
 
 
 @dataclass(frozen=True)
-class _Counting:
+class Counting:
     """How a detector counts photons, whatever its kind."""
 
     attenuation_1_m: Callable[[Floats], Floats]  # in the crystal
@@ -106,7 +106,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
     response = None
     if spec.crystal is not None:
         response = build_response(spec, library.material(spec.crystal), library.material(spec.housing.material))
-    counting = _counting(spec, library, response, kind)
+    counting = counting_of(spec, library, response, kind)
     mu = np.broadcast_to(counting.attenuation_1_m(energy), energy.shape)
     area = fit_effective_area(radius, length, mu.ravel()).reshape(*energy.shape, 5)
     area = area * (counting.counts(energy) * counting.through_housing(energy))[..., None]
@@ -168,16 +168,17 @@ def lines_of(library: Library) -> tuple[Floats, Floats]:
     return energy, yields
 
 
-def _counting(spec: DetectorSpec, library: Library, response: Response | None, kind: str) -> _Counting:
+def counting_of(spec: DetectorSpec, library: Library, response: Response | None, kind: str) -> Counting:
+    """How the detector ``spec`` counts: by its crystal's ``response``, or by its table of efficiencies without one."""
     if kind == "paper_ideal":
-        return _Counting(lambda e: np.full_like(e, OPAQUE_1_M), np.ones_like, np.ones_like)
+        return Counting(lambda e: np.full_like(e, OPAQUE_1_M), np.ones_like, np.ones_like)
     if response is not None:
-        return _Counting(response.attenuation_1_m, response.counts, response.housing_transmission)
+        return Counting(response.attenuation_1_m, response.counts, response.housing_transmission)
     assert spec.efficiency is not None
     points = np.log([p.energy_kev for p in spec.efficiency])
     values = np.log([p.efficiency for p in spec.efficiency])
     housing, thickness = library.material(spec.housing.material), spec.housing.thickness_mm / 1000
-    return _Counting(
+    return Counting(
         lambda e: np.full_like(e, OPAQUE_1_M),
         lambda e: np.exp(np.interp(np.log(e), points, values)),
         lambda e: np.exp(-linear_attenuation(housing, e) * thickness),
@@ -191,7 +192,7 @@ def _shares(value: Floats, nodes: Floats) -> Floats:
 
 
 def _transport(
-    library: Library, energy: Floats, kind: str, counting: _Counting, size: tuple[float, float]
+    library: Library, energy: Floats, kind: str, counting: Counting, size: tuple[float, float]
 ) -> tuple[Floats, Floats, Floats]:
     """The fields attenuation_1_m, scatter_1_m and scattered_bins of a detector."""
     physical = kind == "physical"
@@ -210,7 +211,7 @@ def _transport(
     return attenuation[row], np.moveaxis(tables.scatter_1_m[row], 1, 3), np.moveaxis(bins[row], 1, 3)
 
 
-def _mean_area(counting: _Counting, energy: Floats, size: tuple[float, float]) -> Floats:
+def _mean_area(counting: Counting, energy: Floats, size: tuple[float, float]) -> Floats:
     """Counts per photon and area [...] of photons that come from around, up to a factor.
 
     End on, with the mean chord of the crystal (4 V / S, Cauchy) in place of its length.
@@ -262,7 +263,7 @@ def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins
     peaks = normalised(line_spectra(response, flat))
     of_bins = normalised(line_spectra(response, np.sqrt(edges[1:] * edges[:-1])))
     background = background_spectrum(response, spec.background)
-    rois = _rois(response, spec.spectrometer.rois_kev)
+    rois = rois_of(response, spec.spectrometer.rois_kev)
     return {
         "peak_spectrum": f32(peaks[back].reshape(*energy.shape, -1)),
         "bin_spectrum": f32(of_bins),
@@ -277,10 +278,14 @@ def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins
     }
 
 
-def _rois(response: Response, edges_kev: tuple[float, ...]) -> Floats:
-    """Which channel belongs to which region [channels, R]; those below the first and above the last go to these."""
-    number = np.clip(np.searchsorted(edges_kev, response.channel_centre_kev) - 1, 0, len(edges_kev) - 2)
-    return np.eye(len(edges_kev) - 1)[number]
+def rois_of(response: Response, edges_kev: tuple[float, ...]) -> Floats:
+    """Which channel belongs to which region [channels, R] (`region_of`)."""
+    return np.eye(len(edges_kev) - 1)[region_of(response.channel_centre_kev, edges_kev)]
+
+
+def region_of(energy_kev: Floats, edges_kev: tuple[float, ...]) -> NDArray[np.int64]:
+    """Number of the region of each energy [...]; those below the first and above the last go to these."""
+    return np.clip(np.searchsorted(edges_kev, energy_kev) - 1, 0, len(edges_kev) - 2)
 
 
 def _line_grid(response: Response) -> Floats:

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmsim.config.radiation import Nuclide
 from swarmsim.pytree import on_device
 from swarmsim.radiation import scattering
 from swarmsim.radiation.cylinder import NEAR_COLUMNS, NEAR_ROWS, NEAR_TABLES
@@ -29,6 +30,17 @@ def per_fluence(quantity: Quantity, energy_kev: Floats) -> Floats:
     """Ambient dose equivalent [pSv cm2] or air kerma [pGy cm2] per photon of ``energy_kev`` [...], log-log."""
     column = 1 if quantity == "ambient_dose_equivalent" else 2
     return np.exp(np.interp(np.log(energy_kev), np.log(_CONVERSION[:, 0]), np.log(_CONVERSION[:, column])))
+
+
+def gamma_constant(nuclide: Nuclide, quantity: Quantity = "ambient_dose_equivalent") -> float:
+    """Dose rate 1 m from a point source of 1 MBq without anything around it, in uSv/h (or uGy/h).
+
+    That of the nuclide's lines as its file has them: rays of less energy, such as X-rays under 30 keV, are left out.
+    """
+    energy = np.array([line.energy_kev for line in nuclide.lines])
+    yields = np.array([line.yield_percent / 100 for line in nuclide.lines])
+    fluence_rate = 1e6 / (4.0 * np.pi * 100.0**2)  # 1/(cm2 s) of 1 MBq with one photon to a decay
+    return float(MICRO_PER_HOUR * fluence_rate * (yields @ per_fluence(quantity, energy)))
 
 
 def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equivalent") -> Detector:

@@ -100,10 +100,17 @@ def highest_rate(detector: Detector) -> float:
     paralyzable, non_paralyzable = float(detector.paralyzable_s), float(detector.non_paralyzable_s)
     if paralyzable <= 0.0:
         return np.inf if non_paralyzable <= 0.0 else 1.0 / non_paralyzable
-    # the derivative of log m vanishes where n t_p (1 + n t_n) = 1
-    a, b = paralyzable * non_paralyzable, paralyzable
-    n = 1.0 / b if a == 0.0 else (-b + np.sqrt(b * b + 4.0 * a)) / (2.0 * a)
+    n = saturating_rate(paralyzable, non_paralyzable)
     return float(n * np.exp(-n * paralyzable) / (1.0 + n * non_paralyzable))
+
+
+def saturating_rate(paralyzable_s: float, non_paralyzable_s: float) -> float:
+    """True rate at which a detector with these dead times shows most; inf where more always shows as more (host)."""
+    if paralyzable_s <= 0.0:
+        return np.inf
+    # the derivative of log m vanishes where n t_p (1 + n t_n) = 1
+    a, b = paralyzable_s * non_paralyzable_s, paralyzable_s
+    return float(1.0 / b if a == 0.0 else (-b + np.sqrt(b * b + 4.0 * a)) / (2.0 * a))
 
 
 def exposure_of(detector: Detector, live_s: jax.Array | float) -> jax.Array:

@@ -1,6 +1,5 @@
 """One mission out of a batch, as the record on the host that files, figures and recordings are made from."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -8,32 +7,35 @@ import numpy as np
 
 from swarmsim.estimation import Estimated
 from swarmsim.missions.state import MissionState
+from swarmsim.radiation.dose import gamma_constant
 from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.radiation.rate import highest_rate
 from swarmsim.results.finding import finding
 from swarmsim.results.record import (
     Estimate,
     Event,
+    GammaConstant,
     MissionRecord,
     Phase,
     RadiationMap,
     Samples,
     Sought,
     Spectrum,
+    TrueSource,
     VehicleRecord,
 )
+from swarmsim.results.samples import READ, measured_rows, samples_of, windows_of
 from swarmsim.results.sources import true_sources
 from swarmsim.results.status import Fit, Verdict, assess
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.site.model import height_at
+from swarmsim.world.build import detector_models
 
 LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
 """Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
 UNNAMED = {NONE: "none", UNKNOWN: "unknown"}
 """What a spectrum is said to show where no nuclide is named."""
-SAMPLE = ("time_s", "position_m", "counts", "exposure_s")
-"""Columns that samples have in common with readings."""
 CROWDED = "more vehicles were in one place than the neighbour search holds: a collision may have gone unnoticed"
 
 
@@ -52,6 +54,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         surveyed = _estimates(conclusion.survey.estimated, nuclides)
         final = _estimates(conclusion.estimated, nuclides)
         spectrum = _spectrum(simulation, conclusion)
+    sources = true_sources(simulation, batch.worlds.of(index), vehicles)
     samples = _samples(simulation, batch, index, phases)
     chart = None if conclusion is None else _map(simulation, conclusion.survey)
     verdict = None
@@ -72,7 +75,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         estimate=next(iter(final), None),
         further=final[1:],
         spectrum=spectrum,
-        sources=true_sources(simulation, batch.worlds.of(index), vehicles),
+        sources=sources,
         paths_m=_paths(simulation, end),
         events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
         finding=finding(verdict, final, spectrum, _no_way(simulation, end), _one_nuclide(simulation)),
@@ -80,6 +83,8 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         covered=None if verdict is None else verdict.covered,
         warnings=(CROWDED,) if bool(end.world.crowded) else (),
         drawn=batch.draws.told(index),
+        windows_kev=windows_of(simulation),
+        at_1_m=gamma_constants(simulation, (*surveyed, *final, *sources)),
     )
 
 
@@ -153,33 +158,10 @@ def _samples(simulation: Simulation, batch: MissionBatch, index: int, phases: li
             if (sampled := segment.log.samples[g]) is None:
                 continue
             new = segment.of(index, sampled.new)
-            rows = {name: segment.of(index, getattr(sampled, name))[new] for name in SAMPLE}
+            rows = {name: segment.of(index, getattr(sampled, name))[new] for name in READ}
             rows["vehicle"] = np.broadcast_to(np.asarray(group.member, np.int32), new.shape)[new]
-            found.append(rows)
+            found.append(measured_rows(simulation, group, rows))
     return samples_of(found, phases)
-
-
-def samples_of(found: Sequence[Mapping[str, np.ndarray]], phases: Sequence[Phase]) -> Samples:
-    """Samples in the order of time, from parts with the columns `SAMPLE` and ``vehicle``."""
-    if not found:
-        nothing = np.zeros(0)
-        return Samples(np.zeros(0, np.int32), np.zeros(0, str), nothing, np.zeros((0, 3)), nothing, nothing, nothing)
-    joined = {name: np.concatenate([rows[name] for rows in found]) for name in found[0]}
-    order = np.argsort(joined["time_s"], kind="stable")
-    rows = {name: values[order] for name, values in joined.items()}
-    return Samples(
-        phase=_phase_names(rows["vehicle"], rows["time_s"], phases),
-        count_rate_cps=rows["counts"] / rows["exposure_s"],
-        **rows,
-    )
-
-
-def _phase_names(vehicle: np.ndarray, time_s: np.ndarray, phases: Sequence[Phase]) -> np.ndarray:
-    """Name of the phase [n] that a vehicle was in: of those that it has a part in, the one that began last."""
-    names = np.full(len(vehicle), "", dtype=f"<U{max([1, *(len(p.name) for p in phases)])}")
-    for phase in sorted(phases, key=lambda p: p.start_s):
-        names[np.isin(vehicle, phase.vehicles) & (time_s > phase.start_s)] = phase.name
-    return names
 
 
 def _events(simulation: Simulation, end: MissionState, phases: list[Phase]) -> list[Event]:
@@ -253,7 +235,8 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
     answer = conclusion.identification
     if answer is None or float(conclusion.spectrum.live_s) <= 0.0:
         return None
-    detector, names = simulation.plan.detectors[simulation.plan.spectrometer], _nuclides(simulation)
+    model, names = simulation.plan.spectrometer, _nuclides(simulation)
+    detector = simulation.plan.detectors[model]
     live, index = float(conclusion.spectrum.live_s), int(answer.nuclide)
     lines = simulation.scenario.nuclides[names[index]].lines if index >= 0 else ()
     return Spectrum(
@@ -268,7 +251,17 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         goodness=float(answer.goodness),
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
         lines_kev=np.array([line.energy_kev for line in lines]),
+        detector=detector_models(simulation.scenario)[model],
     )
+
+
+def gamma_constants(simulation: Simulation, sources: tuple[Estimate | TrueSource, ...]) -> dict[str, GammaConstant]:
+    """Gamma constants of the nuclides of ``sources``."""
+    nuclides = {source.nuclide: simulation.scenario.nuclides[source.nuclide] for source in sources}
+    return {
+        name: GammaConstant(gamma_constant(nuclide), gamma_constant(nuclide, "air_kerma"))
+        for name, nuclide in sorted(nuclides.items())
+    }
 
 
 def _sought(simulation: Simulation) -> Sought:

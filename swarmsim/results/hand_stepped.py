@@ -14,8 +14,9 @@ import numpy as np
 
 from swarmsim.missions.state import Track
 from swarmsim.pytree import pytree
-from swarmsim.results.extract import CROWDED, SAMPLE, samples_of
+from swarmsim.results.extract import CROWDED, gamma_constants
 from swarmsim.results.record import Event, MissionRecord, Phase, VehicleRecord
+from swarmsim.results.samples import READ, measured_rows, samples_of, windows_of
 from swarmsim.results.sources import true_sources
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import Simulation
@@ -94,6 +95,7 @@ def record_steps(simulation: Simulation, frames: Frame, seed: int, world: World 
         end_s=float(times[-1]),
         in_time=True,
     )
+    sources = true_sources(simulation, simulation.world if world is None else world, vehicles)
     return MissionRecord(
         name=simulation.scenario.mission.name,
         site=simulation.site_model.name,
@@ -107,12 +109,14 @@ def record_steps(simulation: Simulation, frames: Frame, seed: int, world: World 
         surveyed_s=phase.end_s,
         estimate=None,
         spectrum=None,
-        sources=true_sources(simulation, simulation.world if world is None else world, vehicles),
+        sources=sources,
         paths_m={},
         events=tuple(_events(simulation, frames)),
         finding="stepped by hand, so nothing was estimated",
         warnings=(CROWDED,) if frames.crowded.any() else (),
         drawn=simulation.draws.told(0) if world is None else {},
+        windows_kev=windows_of(simulation),
+        at_1_m=gamma_constants(simulation, sources),
     )
 
 
@@ -139,7 +143,7 @@ def _readings(simulation: Simulation, frames: Frame) -> list[dict[str, np.ndarra
         if reading is None:
             continue
         new = np.concatenate([reading.fresh[:1], np.diff(reading.time_s, axis=0) > 0.0]) & reading.valid
-        rows = {name: getattr(reading, name)[new] for name in SAMPLE}
+        rows = {name: getattr(reading, name)[new] for name in READ}
         rows["vehicle"] = np.broadcast_to(np.asarray(group.member, np.int32), new.shape)[new]
-        found.append(rows)
+        found.append(measured_rows(simulation, group, rows))
     return found

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from swarmsim.config.sources import Form
 
 Floats = NDArray[np.floating]
+Window = tuple[float, float]
+"""Lower and upper end in keV of an energy window."""
 Sought = Literal["nothing", "source", "nuclide"]
 """What a mission was to find; nuclide: a source with its nuclide."""
 
@@ -70,10 +72,17 @@ class Samples:
     counts: Floats  # [n]
     exposure_s: Floats  # [n] live interval that the counts stand for
     count_rate_cps: Floats  # [n] counts / exposure
+    axis: Floats | None = None  # [n, 3] unit vector along the crystal, mean, world; None, as all below: not recorded
+    windows: Floats | None = None  # [n, W] counts by `MissionRecord.windows_kev`, nan: not of this detector
+    live_s: Floats | None = None  # [n] part of the exposure in which the detector was not dead, by its law
+    dose_rate_usv_h: Floats | None = None  # [n] H*(10) by the counts (`DoseOperator`), natural background included
+    dose_rate_std_usv_h: Floats | None = None  # [n] its standard deviation by counting statistics
+    kerma_rate_ugy_h: Floats | None = None  # [n] air kerma rate by the counts
 
     def rows(self, index: NDArray[Any] | slice) -> "Samples":
         """Those that ``index`` chooses, in its order."""
-        return Samples(*(getattr(self, f)[index] for f in self.__dataclass_fields__))
+        columns: dict[str, Any] = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return replace(self, **{name: each[index] for name, each in columns.items() if each is not None})
 
     def of_phase(self, phase: str) -> "Samples":
         """Those of one phase."""
@@ -126,6 +135,7 @@ class Spectrum:
     lines_kev: Floats = field(default_factory=lambda: np.zeros(0))  # [l] gamma lines of the named nuclide, for labels
     unknown: float = 0.0  # probability of a source that no nuclides of the library explain
     goodness: float = 1.0  # p-value of the deviance of the fit
+    detector: str = ""  # model that took it
 
 
 @dataclass(frozen=True)
@@ -150,6 +160,14 @@ def carried_m(position_m: Floats, quaternion: Floats, offset_m: Floats | None) -
     turn = np.asarray(quaternion, float)
     twice = 2.0 * np.cross(turn[:, 1:], offset_m)
     return place + offset_m + turn[:, :1] * twice + np.cross(turn[:, 1:], twice)
+
+
+@dataclass(frozen=True)
+class GammaConstant:
+    """Dose rates 1 m from a source of 1 MBq with nothing around it."""
+
+    ambient_usv_h: float  # ambient dose equivalent H*(10)
+    kerma_ugy_h: float  # air kerma
 
 
 @dataclass(frozen=True)
@@ -190,6 +208,8 @@ class MissionRecord:
     survey_further: tuple[Estimate, ...] = ()  # further sources by the survey's counts
     further: tuple[Estimate, ...] = ()  # further sources by all counts
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
+    windows_kev: tuple[Window, ...] = ()  # energy windows of all detectors, lowest first
+    at_1_m: Mapping[str, GammaConstant] = field(default_factory=dict)  # by nuclide, of those found and the true ones
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from swarmsim.atomic_folder import atomic_folder
@@ -24,10 +23,10 @@ from swarmsim.playback.recording import write_recording
 from swarmsim.results import names
 from swarmsim.results.out_folder import check_out, keep_elsewhere, told_of
 from swarmsim.results.record import MissionRecord, RadiationMap
-from swarmsim.results.summary import Timings, all_keys, batch_row, batch_summary, summary
+from swarmsim.results.summary import Timings, batch_row, batch_summary, summary
+from swarmsim.results.tables import measurements_table, missions_table, spectrum_table, trajectories_table
 from swarmsim.site.model import SiteModel
 
-_FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x y z, body (forward left up) to world"
 _FULL_BYTES = 2_000_000  # less is free where Rerun could not write its next chunk
 _NO_ROOM = os.strerror(errno.ENOSPC)
 
@@ -94,6 +93,8 @@ def _parts(simulation: Built, records: Sequence[MissionRecord], timings: Timings
     def write_tables(folder: Path) -> None:
         pq.write_table(measurements_table(first), folder / names.MEASUREMENTS, compression="zstd")
         pq.write_table(trajectories_table(first), folder / names.TRAJECTORIES, compression="zstd")
+        if first.spectrum is not None:
+            pq.write_table(spectrum_table(first, first.spectrum), folder / names.SPECTRUM, compression="zstd")
         if rows:
             pq.write_table(missions_table(rows), folder / names.MISSIONS, compression="zstd")
 
@@ -157,69 +158,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list):
         return [_finite(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _metadata(record: MissionRecord, what: str) -> dict[str, str]:
-    return {"content": what, "mission": record.name, "site": record.site, "seed": str(record.seed), "frame": _FRAME}
-
-
-def _dictionary(texts: Sequence[str], index: np.ndarray) -> pa.DictionaryArray:
-    return pa.DictionaryArray.from_arrays(pa.array(index, pa.int32()), pa.array(list(texts), pa.string()))
-
-
-def measurements_table(record: MissionRecord) -> pa.Table:
-    """Every detector sample, in time order: one row each, units in the column names."""
-    samples = record.samples
-    phases, index = np.unique(samples.phase, return_inverse=True)
-    columns = {
-        "vehicle": _dictionary([v.name for v in record.vehicles], samples.vehicle),
-        "phase": _dictionary([str(p) for p in phases], index),
-        "time_s": samples.time_s.astype(np.float64),
-        "east_m": samples.position_m[:, 0].astype(np.float32),
-        "north_m": samples.position_m[:, 1].astype(np.float32),
-        "up_m": samples.position_m[:, 2].astype(np.float32),
-        "counts": samples.counts.astype(np.float32),
-        "exposure_s": samples.exposure_s.astype(np.float32),
-        "count_rate_cps": samples.count_rate_cps.astype(np.float32),
-    }
-    return pa.table(
-        columns, metadata=_metadata(record, "detector samples; position is the crystal's, time the end of a count")
-    )
-
-
-def trajectories_table(record: MissionRecord) -> pa.Table:
-    """The tracks of all vehicles, one after the other: one row for each logged time."""
-    vehicles = record.vehicles
-    lengths = [len(v.time_s) for v in vehicles]
-
-    def column(values: list[np.ndarray], kind: type = np.float32) -> np.ndarray:
-        return np.concatenate(values).astype(kind)
-
-    columns: dict[str, Any] = {
-        "vehicle": _dictionary([v.name for v in vehicles], np.repeat(np.arange(len(vehicles)), lengths)),
-        "time_s": column([v.time_s for v in vehicles], np.float64),
-    }
-    for k, axis in enumerate(("east", "north", "up")):
-        columns[f"{axis}_m"] = column([v.position_m[:, k] for v in vehicles])
-    for k, part in enumerate("wxyz"):
-        columns[f"quaternion_{part}"] = column([v.quaternion[:, k] for v in vehicles])
-    for k, axis in enumerate(("east", "north", "up")):
-        columns[f"velocity_{axis}_m_s"] = column([v.velocity_m_s[:, k] for v in vehicles])
-    columns["energy_wh"] = column([v.energy_wh for v in vehicles])
-    columns["battery_fraction"] = column([v.battery_fraction for v in vehicles])
-    return pa.table(columns, metadata=_metadata(record, "vehicle tracks"))
-
-
-def missions_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
-    """One row for each mission, with the columns of all rows; all-null columns stay numeric."""
-    columns = {}
-    for key in all_keys(rows):
-        values = [row.get(key) for row in rows]
-        empty = all(v is None for v in values)
-        columns[key] = (
-            pa.array(values, pa.string() if key.endswith("nuclide") else pa.float64()) if empty else pa.array(values)
-        )
-    return pa.table(columns)
 
 
 def _write_map(made: RadiationMap, path: Path) -> None:

@@ -32,6 +32,10 @@ _ESTIMATE_KEYS = (
     "activity_std_mbq",
     "activity_error_percent",
     "background_scale",
+    "dose_rate_1m_usv_h",
+    "dose_rate_1m_std_usv_h",
+    "kerma_rate_1m_ugy_h",
+    "kerma_rate_1m_std_ugy_h",
 )
 INTACT = "intact"
 STATES = {
@@ -81,17 +85,19 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
             "position_m": None if hotspot is None else _plain(hotspot),
             "error_m": None if hotspot is None else _nearest(hotspot, record.sources)[1],
         },
-        "survey_estimate": estimate_summary(record.survey_estimate, record.sources),
-        "source": estimate_summary(record.estimate, record.sources),
-        "further_sources": [estimate_summary(one, record.sources) | {"nuclide": one.nuclide} for one in record.further],
+        "survey_estimate": estimate_summary(record.survey_estimate, record),
+        "source": estimate_summary(record.estimate, record),
+        "further_sources": [estimate_summary(one, record) | {"nuclide": one.nuclide} for one in record.further],
         "nuclide": {
             "name": named(spectrum),
             "confidence": None if spectrum is None else float(spectrum.confidence),
         },
+        "dose_rate": dose_summary(record),
         "drawn": dict(record.drawn),
         "true_sources": [
             {"nuclide": s.nuclide, "position_m": _plain(s.position_m), "activity_mbq": float(s.activity_mbq)}
             | _form(record, s)
+            | _true_dose(record, s)
             for s in record.sources
         ],
         "vehicles": [
@@ -168,14 +174,16 @@ def _hotspot(made: RadiationMap | None) -> NDArray[np.floating] | None:
     return None if made is None or not len(made.hotspots_m) else np.asarray(made.hotspots_m[0], float)
 
 
-def estimate_summary(estimate: Estimate | None, sources: tuple[TrueSource, ...]) -> dict[str, Any]:
-    """An estimate with its standard deviations and its errors against the nearest true source.
+def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[str, Any]:
+    """An estimate with its standard deviations and its errors against the nearest true source of the mission.
 
     ``error_m`` is the distance in space, ``error_horizontal_m`` the distance on the map; ``activity_error_percent`` is
-    the size of the error over the true activity.
+    the size of the error over the true activity. Dose rates 1 m from the source are those of its activity with nothing
+    around it; their standard deviations are the activity's, for the nuclide that was estimated.
     """
     if estimate is None:
         return dict.fromkeys(_ESTIMATE_KEYS)
+    sources, at_1_m = record.sources, record.at_1_m.get(estimate.nuclide)
     position = np.asarray(estimate.position_m, float)
     nearest, error = _nearest(position, sources)
     activity = float(estimate.activity_mbq)
@@ -190,8 +198,46 @@ def estimate_summary(estimate: Estimate | None, sources: tuple[TrueSource, ...])
         if nearest is None or nearest.activity_mbq <= 0.0
         else 100.0 * abs(activity - float(nearest.activity_mbq)) / float(nearest.activity_mbq),
         float(estimate.background_scale),
+        None if at_1_m is None else at_1_m.ambient_usv_h * activity,
+        None if at_1_m is None else at_1_m.ambient_usv_h * float(estimate.activity_std_mbq),
+        None if at_1_m is None else at_1_m.kerma_ugy_h * activity,
+        None if at_1_m is None else at_1_m.kerma_ugy_h * float(estimate.activity_std_mbq),
     )
     return dict(zip(_ESTIMATE_KEYS, values, strict=True))
+
+
+def _true_dose(record: MissionRecord, source: TrueSource) -> dict[str, float]:
+    """Dose rates 1 m from a true source; nothing where its nuclide's constant is not recorded."""
+    constant = record.at_1_m.get(source.nuclide)
+    if constant is None:
+        return {}
+    activity = float(source.activity_mbq)
+    return {
+        "dose_rate_1m_usv_h": constant.ambient_usv_h * activity,
+        "kerma_rate_1m_ugy_h": constant.kerma_ugy_h * activity,
+    }
+
+
+def dose_summary(record: MissionRecord) -> dict[str, Any] | None:
+    """The greatest dose rate that a detector showed, by its counts, and where; None where none is recorded.
+
+    Natural background is included. Of many readings the greatest one lies above the truth by about its statistical
+    standard deviation, which leaves out the error of the conversion (see `swarmsim.radiation.dose_operator`).
+    """
+    samples = record.samples
+    ambient, std, kerma = samples.dose_rate_usv_h, samples.dose_rate_std_usv_h, samples.kerma_rate_ugy_h
+    if ambient is None or std is None or kerma is None or not len(ambient):
+        return None
+    best = int(np.argmax(ambient))
+    return {
+        "basis": "counts",
+        "greatest_usv_h": float(ambient[best]),
+        "greatest_std_usv_h": float(std[best]),
+        "greatest_kerma_ugy_h": float(kerma[best]),
+        "vehicle": record.vehicles[int(samples.vehicle[best])].name,
+        "time_s": float(samples.time_s[best]),
+        "position_m": _plain(samples.position_m[best]),
+    }
 
 
 def _nearest(
@@ -251,13 +297,15 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     row |= _axes("hotspot", None if hotspot is None else _plain(hotspot), ("east_m", "north_m"))
     row["hotspot_error_m"] = None if hotspot is None else _nearest(hotspot, record.sources)[1]
     for name, estimate in (("survey_estimate", record.survey_estimate), ("source", record.estimate)):
-        values = estimate_summary(estimate, record.sources)
+        values = estimate_summary(estimate, record)
         row |= _axes(name, values.pop("position_m"), ("east_m", "north_m", "up_m"))
         row |= _axes(name, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
         row |= {f"{name}_{key}": value for key, value in values.items()}
     row["sources_found"] = len(record.estimates)
     row["nuclide"] = named(record.spectrum)
     row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
+    dose = dose_summary(record)
+    row["dose_rate_greatest_usv_h"] = None if dose is None else dose["greatest_usv_h"]
     row["crashed"] = sum(bool(v.crashed) for v in record.vehicles)
     saved = {e.vehicle for e in record.events if e.kind in FAILSAFES}
     row["failsafes"] = sum(v.name in saved for v in record.vehicles)

@@ -24,7 +24,7 @@ from swarmsim.runtime.progress import Progress
 from tests.config.project import line_of, make_project, spoil
 
 ALTITUDE = "phases.survey.settings.altitude_m=30"
-COMMANDS = ("run", "view", "check", "schema", "list", "init", "import-site")
+COMMANDS = ("run", "view", "check", "schema", "list", "init", "import-site", "export-n42")
 SUMMARY: dict[str, Any] = {
     "status": "located",
     "finding": "Co-60 of 171 MBq at (12.1, 4.0)",

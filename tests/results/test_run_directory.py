@@ -27,6 +27,7 @@ ALL = {
     "scenario.yaml",
     "summary.json",
     "measurements.parquet",
+    "spectrum.parquet",
     "trajectories.parquet",
     "radiation_map.npz",
     "mission.rrd",
@@ -148,13 +149,13 @@ def test_a_batch_that_found_nothing_keeps_its_columns(site: SiteModel, tmp_path:
 
 def test_a_mission_that_found_nothing_is_written_whole(site: SiteModel, tmp_path: Path) -> None:
     write_run(built(site), [synthetic.mission(found=False, log_hz=5.0, sample_hz=2.0)], tmp_path / "none", TIMINGS)
-    assert {path.name for path in (tmp_path / "none").iterdir()} == ALL
+    assert {path.name for path in (tmp_path / "none").iterdir()} == ALL - {"spectrum.parquet"}
     assert json.loads((tmp_path / "none" / "summary.json").read_text())["source"]["position_m"] is None
 
 
 def test_a_mission_without_a_map_has_no_file_of_one(site: SiteModel, tmp_path: Path) -> None:
     content = write_run(built(site), [synthetic.swarm(20, 30.0)], tmp_path / "swarm")
-    assert {path.name for path in (tmp_path / "swarm").iterdir()} == ALL - {"radiation_map.npz"}
+    assert {path.name for path in (tmp_path / "swarm").iterdir()} == ALL - {"radiation_map.npz", "spectrum.parquet"}
     assert [path.name for path in (tmp_path / "swarm" / "figures").glob("*.png")] == ["trajectories.png"]
     assert pq.read_table(tmp_path / "swarm" / "measurements.parquet").num_rows == 0
     assert content["success"]
