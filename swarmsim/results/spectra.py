@@ -78,7 +78,7 @@ def _number(simulation: Simulation, vehicle: str) -> int:
 def _expected(
     world: World, simulation: Simulation, seed: int, number: int
 ) -> Callable[[Floats, Floats, Floats], Floats]:
-    """Expected spectra [n, channels], up to a factor, at places [n, 3], axes [n, 3] and times [n] of vehicle ``number``."""
+    """Expected spectra [n, channels], up to a factor, at n places, axes and times of vehicle ``number``."""
     counter = world.groups[place_of(simulation, number)[0]].counter
     assert counter is not None
     compute = jax.jit(partial(_spectra, counter.index))
