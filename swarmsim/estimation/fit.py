@@ -36,6 +36,7 @@ MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count f
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
 LOOSE = 1e-4  # precision of what has no prior
+TAIL = 4.0  # degrees of freedom of a window's gain: a fence between two rays takes a third of the counts
 
 
 @pytree
@@ -91,7 +92,7 @@ class Linearised:
     common: jax.Array  # [n, R, P] by ln(activity), the others' factors (logarithms), levels, lengths
     own: jax.Array  # [n, R, 2] by the window's background and gain
     moved: jax.Array  # [n, R, 3] by the place
-    precision: jax.Array  # [n, 2] of the priors of the window's own unknowns
+    variance: jax.Array  # [n, 2] of the priors of the window's own unknowns, background and gain
     registered: jax.Array  # [n] derivative of the registered counts of a window by the true ones
 
 
@@ -124,20 +125,30 @@ def linearised(problem: Problem, source: Rates, others: Others, where: jax.Array
         own=seen(jnp.stack([background, signal], axis=-1)),
         moved=seen(moved),
         registered=share + fall * total,
-        precision=_precision(problem, jnp.sum(own, axis=1), jnp.sum(rest, axis=2), others, where, source.edge),
+        variance=_variance(problem, jnp.sum(own, axis=1), jnp.sum(rest, axis=2), others, where, source.edge),
     )
 
 
-def _precision(
+def _variance(
     problem: Problem, own: jax.Array, rest: jax.Array, others: Others, where: jax.Array, edge: jax.Array
 ) -> jax.Array:
-    """Precisions [n, 2] of a window's own unknowns; a gain stands for all sources, weighted with what they add."""
+    """Variances [n, 2] of a window's own unknowns; a gain stands for all sources, weighted with what they add."""
     total = own + jnp.sum(rest, axis=0)
     varied = own * (variance_of(problem, where) + edge) + jnp.sum(rest * others.variance, axis=0)
     model = jnp.square(problem.model_std)
     variance = jnp.where(total > 0.0, varied / jnp.maximum(total, 1e-20), model)
     background = jnp.broadcast_to(jnp.square(problem.background_std), variance.shape)
-    return 1.0 / jnp.clip(jnp.stack([background, variance], axis=-1), 1e-6, 1.0)
+    return jnp.clip(jnp.stack([background, variance], axis=-1), 1e-6, 1.0)
+
+
+def _own_precision(variance: jax.Array, u: Unknowns) -> jax.Array:
+    """Precisions [n, 2] of the priors of a window's own unknowns at ``u``, from their variances.
+
+    The gain has Student's t-distribution: its precision is that of the normal distribution with the same slope at ``u``
+    (iteratively reweighted least squares: Lange, Little and Taylor, JASA 84, 1989, 881).
+    """
+    heavy = (TAIL + 1.0) / (TAIL * variance[:, 1] + jnp.square(u.gain))
+    return jnp.stack([1.0 / variance[:, 0], heavy], axis=-1)
 
 
 def prior_precision(problem: Problem, sources: int) -> jax.Array:
@@ -173,7 +184,8 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
     assert m.rois is not None
     weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
     left = weight * (m.rois - model.mean)
-    common_precision, own_precision = prior_precision(problem, u.others.shape[0]), model.precision
+    common_precision = prior_precision(problem, u.others.shape[0])
+    own_precision = _own_precision(model.variance, u)
     nuisance = window_unknowns(u)
     columns = jnp.concatenate([model.common, model.moved], axis=-1)
     # products of a few numbers for each window are written as sums: a batched matrix product would be slower
@@ -200,7 +212,7 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
         crossing=crossing[:, :, :p],
         own_push=own_push,
         towards=whole[p:, p:] - across.T @ inverse @ across,
-        log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(determinant / jnp.prod(own_precision, axis=1)), 0.0)),
+        log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(determinant * jnp.prod(model.variance, axis=1)), 0.0)),
         fitted=jnp.sum(jnp.where(m.valid, 2.0 - jnp.einsum("naa,na->n", own, own_precision), 0.0)),
     )
 
@@ -238,8 +250,9 @@ def window_unknowns(u: Unknowns) -> jax.Array:
 def log_prior(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
     """Log prior [] of the unknowns but the place, up to a constant."""
     shared = prior_precision(problem, u.others.shape[0]) * jnp.square(_common(u))
-    own = jnp.where(problem.measurements.valid[:, None], model.precision * jnp.square(window_unknowns(u)), 0.0)
-    return -0.5 * (jnp.sum(shared) + jnp.sum(own))
+    relative = jnp.square(window_unknowns(u)) / model.variance
+    own = relative[:, 0] + (TAIL + 1.0) * jnp.log1p(relative[:, 1] / TAIL)
+    return -0.5 * (jnp.sum(shared) + jnp.sum(jnp.where(problem.measurements.valid, own, 0.0)))
 
 
 def settle(
