@@ -99,14 +99,14 @@ def views() -> Floats:
 
 @app.default
 def main(
-    file: Path = packaged_dir() / "elements" / "ground.csv", *,
+    file: Annotated[Path | None, Parameter(help="Where to; the packaged table by default.")] = None, *,
     photons: Annotated[int, Parameter(help="Photons of each energy.")] = 400_000,
 ) -> None:  # fmt: skip
     """Write the table."""
     material, places = load_library().material(MATERIAL), views()
     lines = [
-        "# Photons above 30 keV that an even ground of soil scatters to a detector, over the photons of the bare source",
-        f"# there, in {BINS} bins of equal width in ln(energy) from 30 keV to the energy of the source, which lies",
+        "# Photons above 30 keV that an even ground of soil scatters to a detector, over those of the bare source,",
+        f"# in {BINS} bins of equal width in ln(energy) from 30 keV to the energy of the source, which lies",
         f"# {SOURCE_M:g} m above the ground; the detector's height above it and level distance from the source.",
         "# By experiments/transport/ground.py.",
         "energy_kev,height_m,apart_m," + ",".join(f"s{k}" for k in range(BINS)),
@@ -123,6 +123,7 @@ def main(
         for place, row in zip(places, found, strict=True):
             lines.append(f"{energy:g},{place[2]:g},{place[0]:g}," + ",".join(f"{x:.3g}" for x in row))
         print(f"{energy:g} keV, known to {np.max(error / found.sum(axis=1)):.1%} at worst", flush=True)
+    file = file or packaged_dir() / "elements" / "ground.csv"
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

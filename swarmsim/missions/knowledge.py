@@ -26,6 +26,7 @@ from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
 from swarmsim.sensors.radiation import length_factors, sensitivity_factor
 from swarmsim.site import crossed
+from swarmsim.site.rays import stretched
 from swarmsim.world.model import World
 
 
@@ -136,8 +137,7 @@ def accumulate_spectrum(
 
     def one(position: jax.Array, axis: jax.Array) -> jax.Array:
         def of_source(source: Source) -> jax.Array:
-            way = crossed(site, source.position_m, position)
-            way = replace(way, length_m=way.length_m * lengths)
+            way = stretched(crossed(site, source.position_m, position), lengths)
             return sensitivity * spectrum_rate(detector, source, way, position, axis)
 
         natural = background_factor(background, site, key, position, detector.background_height_m)

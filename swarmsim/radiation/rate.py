@@ -26,13 +26,32 @@ def line_rates(
     ``axis`` [3] its unit axis, world ENU. Scattered photons (`swarmsim.radiation.walls`) come from the direction of the
     source.
     """
-    direct, scattered = transmission(detector, source.nuclide, way)
+    direct, scattered, ground = _parts(detector, source, way, position_m, axis)
+    return direct, scattered + ground
+
+
+def _parts(
+    detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Counts per second [L] of photons that did not scatter, that scattered on the way, and that came by the ground."""
     seen = _seen(detector, source, position_m, axis)
-    return seen * direct, seen * scattered
+    direct, scattered = transmission(detector, source.nuclide, way)
+    return seen * direct, seen * scattered, seen * (direct + scattered) * from_ground(detector, source.nuclide, way)
+
+
+def from_ground(detector: Detector, nuclide: jax.Array, way: Crossed) -> jax.Array:
+    """Counts [..., L] of photons that the ground scatters over those of the photons from the source.
+
+    Walls hold back the former as the latter.
+    """
+    if way.shape is None or detector.kind == "paper_ideal":
+        return jnp.zeros(detector.yields.shape[1])
+    share = way.shape.ground[..., None, :] * detector.ground[nuclide]
+    return share[..., 0] + share[..., 1]
 
 
 def transmission(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[jax.Array, jax.Array]:
-    """Unscattered and scattered counts [L] behind matter, relative to the counts without it."""
+    """Unscattered counts [L] behind matter and those that it scatters, relative to the counts without it."""
     if detector.kind == "paper_ideal":
         direct = jnp.exp(-detector.attenuation_1_m[nuclide] @ way.length_m)
         return direct, jnp.zeros_like(direct)
@@ -128,17 +147,18 @@ def spectrum_rate(
     detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
 ) -> jax.Array:
     """Counts per second in each channel [channels] that ``source`` adds; they sum to `net_rate`."""
-    direct, scattered = line_rates(detector, source, way, position_m, axis)
+    direct, scattered, ground = _parts(detector, source, way, position_m, axis)
     shares = scattered_shares(detector, source.nuclide, way)
-    bins = jnp.einsum("l,lb->b", scattered, shares)
+    bins = jnp.einsum("l,lb->b", scattered, shares) + ground @ detector.ground_bins[source.nuclide]
     return direct @ detector.peak_spectrum[source.nuclide] + bins @ detector.bin_spectrum
 
 
 def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array) -> jax.Array:
     """Counts per second in each region of interest [R] that ``source`` adds; they sum to `net_rate`."""
-    direct, scattered = line_rates(detector, source, way, position_m, axis)
+    direct, scattered, ground = _parts(detector, source, way, position_m, axis)
     shares = _shares(detector, source.nuclide, way, detector.scattered_rois)
-    return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares)
+    of_ground = ground @ detector.ground_rois[source.nuclide]
+    return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares) + of_ground
 
 
 def roi_rates_and_slopes(
@@ -175,11 +195,13 @@ def roi_rates_and_slopes(
     part = jnp.where(depth[..., None] > 1e-6, layers / jnp.maximum(depth, 1e-6)[..., None], 1.0 / layers.shape[-1])
     mixed = jnp.stack([(1.0 - deep)[..., None] * part, deep[..., None] * part], axis=2)  # [n, L, depths, M]
     shares = jnp.einsum("nldm,dmlr->nlr", mixed, detector.scattered_rois[nuclide])
-    rates = direct @ peaks + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
+    ground = from_ground(detector, nuclide, way)[..., None] * detector.ground_rois[nuclide]
+    shares, peaks = shares + ground, peaks + ground  # [n, L, R]
+    rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
     slants = found.slant_layers[..., chosen]  # [n, L, U]
     changes = layers[..., chosen] * found.by_depth[..., None] + slants * found.by_slant[..., None]
     of_scattered = (seen[..., None] * changes)[..., None] * shares[:, :, None]
-    return rates, jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[:, None], axis=1)
+    return rates, jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[:, :, None], axis=1)
 
 
 def observed_rois(detector: Detector, net_cps: jax.Array, background: jax.Array | float = 1.0) -> jax.Array:

@@ -56,7 +56,9 @@ def constants() -> Constants:
     return Constants(**{name: float(value) for name, value in rows})
 
 
-def scattered_counts(attenuation_1_m: jax.Array, scatter_1_m: jax.Array, air: int | None, way: Crossed) -> Scattered:
+def scattered_counts(
+    attenuation_1_m: jax.Array, scatter_1_m: jax.Array, air: int | None, way: Crossed, k: Constants | None = None
+) -> Scattered:
     """What arrives of the photons that matter on the way [..., M] scatters.
 
     Behind several layers with depths t_k it is that of the depth sum(t_k), with coefficients averaged over the layers
@@ -68,6 +70,7 @@ def scattered_counts(attenuation_1_m: jax.Array, scatter_1_m: jax.Array, air: in
         scatter_1_m: [positions, COEFFICIENTS, L, M], see `Detector`.
         air: number of the material that is no wall.
         way: what the line crosses.
+        k: those of the project's table by default.
     """
     slant_layers = way.length_m[..., None, :] * attenuation_1_m
     thin_m = way.length_m if way.shape is None else way.shape.thin_m
@@ -86,7 +89,7 @@ def scattered_counts(attenuation_1_m: jax.Array, scatter_1_m: jax.Array, air: in
     if way.shape is None:
         zero = jnp.zeros_like(depth)
         return Scattered(layers, depth, slant_layers, slant, depth * falling, falling * rising, zero)
-    k, small = constants(), 1e-9
+    k, small = k or constants(), 1e-9
     of_walls = 1.0 if air is None else 1.0 - layers[..., air] / (depth + small)
     narrow, closed = of_walls * (1.0 - way.shape.spread)[..., None], of_walls * way.shape.closed[..., None]
     cosine = (depth + small) / (slant + small)

@@ -11,7 +11,7 @@ import numpy as np
 from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
-from swarmsim.site.model import Obstacles, Site
+from swarmsim.site.model import Obstacles, Site, sample
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
 BLOCK = 1024  # segments intersected with all boxes at a time, so that the result fits the cache
@@ -26,6 +26,7 @@ class Shape:
     thin_m: jax.Array  # [..., M] length the shortest way through each piece of matter that is crossed; <= length_m
     spread: jax.Array  # [...] 0..1: part of an infinite wall's scattered photons that come from a wall of its size
     closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box, whose other walls scatter too
+    ground: jax.Array  # [..., 2] how the ground shines, see `mirrored`
 
 
 @pytree
@@ -46,7 +47,9 @@ def stretched(way: Crossed, factors: jax.Array) -> Crossed:
 def nothing_crossed(n: int, materials: int) -> Crossed:
     """Of n segments that have no length."""
     zero, row = jnp.zeros((n, materials)), jnp.zeros(n)
-    return Crossed(length_m=zero, place=zero, shape=Shape(thin_m=zero, spread=row, closed=row))
+    return Crossed(
+        length_m=zero, place=zero, shape=Shape(thin_m=zero, spread=row, closed=row, ground=jnp.zeros((n, 2)))
+    )
 
 
 def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
@@ -62,7 +65,7 @@ def crossed(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
 
     Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
     The terrain is crossed exactly too (`swarmsim.site.terrain_crossing`). Lengths are continuous in both ends and
-    differentiable almost everywhere; places, ``spread`` and ``closed`` are taken as constant by derivatives. Where
+    differentiable almost everywhere; of the rest only ``thin_m`` is, the others are constants to derivatives. Where
     obstacles overlap, the lengths are scaled so that their sum does not exceed the distance. The remaining distance is
     that through ``air`` if the table has it, and then the sum equals the distance.
     """
@@ -94,9 +97,23 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Bo
         rest = jnp.where(materials == site.material_names.index("air"), jnp.maximum(1.0 - total, 0.0), 0.0)
         fractions, thin = fractions + rest, thin + rest
     spread, closed = 1.0 - jnp.sum(found.narrow) / walls, jnp.sum(found.closed) / walls
-    place, spread, closed = jax.lax.stop_gradient((jnp.clip(place, 0.0, 1.0), spread, closed))
-    shape = Shape(thin_m=distance * thin, spread=spread, closed=closed)
+    constant = (jnp.clip(place, 0.0, 1.0), spread, closed, mirrored(site, a, b))
+    place, spread, closed, shines = jax.lax.stop_gradient(constant)
+    shape = Shape(thin_m=distance * thin, spread=spread, closed=closed, ground=shines)
     return Crossed(length_m=distance * fractions, place=place, shape=shape)
+
+
+def mirrored(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
+    """(r / r')^2 (sqrt(u), u) [2] of a segment above the ground: `swarmsim.radiation.ground`.
+
+    r is the distance of its ends, r' that of the one from the other's mirror image below the ground, u the sine of the
+    image's elevation; by the ends' heights above the ground below each.
+    """
+    one, other = (jnp.maximum(x[2] - sample(site.terrain_m, site, x[:2]), 0.0) for x in (a, b))
+    level2 = jnp.square(b[0] - a[0]) + jnp.square(b[1] - a[1])
+    both, image2 = one + other, level2 + jnp.square(one + other) + 1e-12
+    u, ratio = both * jax.lax.rsqrt(image2), (level2 + jnp.square(one - other)) / image2
+    return ratio * jnp.stack([jnp.sqrt(u), u])
 
 
 def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
