@@ -130,7 +130,7 @@ def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     size = min(BLOCK, n)
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
     found = jax.lax.map(jax.vmap(lambda end: _crossed(padded, above, a, end)), ends)
-    return jax.tree.map(lambda x: x.reshape(-1, x.shape[-1])[:n], found)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
 
 
 def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = None) -> Crossed:
