@@ -195,7 +195,7 @@ def fitted(found: list[Case], way: Crossed, detector: Detector) -> Constants:
         return np.log((direct + np.asarray(counts(tuple(values)), float)) / (direct + scattered))
 
     start = np.array(constants())
-    return Constants(*least_squares(apart, start, loss="soft_l1", f_scale=0.1, diff_step=1e-2).x)
+    return Constants(*least_squares(apart, start, bounds=(0.0, np.inf), loss="soft_l1", f_scale=0.1, diff_step=1e-2).x)
 
 
 @app.default
