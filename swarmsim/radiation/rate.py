@@ -45,7 +45,7 @@ def from_ground(detector: Detector, nuclide: jax.Array, way: Crossed) -> jax.Arr
     Walls hold back the former as the latter.
     """
     if way.shape is None or detector.kind == "paper_ideal":
-        return jnp.zeros(detector.yields.shape[1])
+        return jnp.zeros((*way.length_m.shape[:-1], detector.yields.shape[1]))
     share = way.shape.ground[..., None, :] * detector.ground[nuclide]
     return share[..., 0] + share[..., 1]
 

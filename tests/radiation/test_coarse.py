@@ -77,6 +77,20 @@ def test_rates_with_slopes_are_the_rates_and_slopes_their_differences(
     assert np.max(np.abs(slopes - difference)) <= 0.15 * np.max(np.abs(difference))
 
 
+def test_a_way_without_a_shape_has_wide_walls_and_no_ground(detectors: Detectors) -> None:
+    d = detectors["nai_1p5x1p5", "physical"]
+    way, place, axis = ways(d, 5, 6)
+    ones = jnp.ones(6)
+    shape = Shape(thin_m=way.length_m, spread=ones, closed=0.0 * ones, ground=jnp.zeros((6, 2)))
+    columns = tuple(d.material_names.index(name) for name in ("air", "concrete"))
+    found, expected = (
+        _with_slopes(d, source(0), replace(way, shape=each), place, axis, by=columns) for each in (None, shape)
+    )
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5 * float(jnp.max(jnp.abs(other))))
+
+
 def test_few_lines_keep_the_counts_of_every_nuclide_behind_concrete(detectors: Detectors) -> None:
     full = detectors["nai_1p5x1p5", "physical"]
     few = coarse(full, LINES, MATERIALS)
