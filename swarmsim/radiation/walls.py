@@ -63,7 +63,7 @@ def scattered_counts(
 
     Behind several layers with depths t_k it is that of the depth sum(t_k), with coefficients averaged over the layers
     with weights t_k; each layer's lie between those of a wall near the source and of one half way. Derivatives leave
-    out that these weights change.
+    out that these weights change, and take what changes for a wall.
 
     Args:
         attenuation_1_m: [L, M].
@@ -91,13 +91,18 @@ def scattered_counts(
         return Scattered(layers, depth, slant_layers, slant, depth * falling, falling * rising, zero)
     k, small = k or constants(), 1e-9
     of_walls = 1.0 if air is None else 1.0 - layers[..., air] / (depth + small)
-    narrow, closed = of_walls * (1.0 - way.shape.spread)[..., None], of_walls * way.shape.closed[..., None]
+    missing, other = (1.0 - way.shape.spread)[..., None], way.shape.closed[..., None]
+    narrow, closed = of_walls * missing, of_walls * other
     cosine = (depth + small) / (slant + small)
     log_cosine, power = jnp.log(cosine), k.slant + k.slant_per_depth * depth
-    straight = (1.0 - narrow) * (1.0 - k.around * closed) * jnp.exp(power * log_cosine)
-    back = k.back * closed * jnp.exp(-k.back_per_depth * depth)
+    slanted, softened = jnp.exp(power * log_cosine), k.back * jnp.exp(-k.back_per_depth * depth)
+    straight, back = (1.0 - narrow) * (1.0 - k.around * closed) * slanted, closed * softened
     share = straight + k.around * closed + back
     of_share = straight * (power + k.slant_per_depth * depth * log_cosine) - k.back_per_depth * depth * back
+    # a thicker wall makes up more of the depth
+    by_walls = other * (k.around + softened)
+    by_walls -= slanted * (missing * (1.0 - k.around * closed) + k.around * other * (1.0 - narrow))
+    of_share += (1.0 - of_walls) * by_walls
     return Scattered(
         layers, depth, slant_layers, slant, depth * falling * share,
         falling * (rising * share + of_share), -falling * straight * power * cosine,
