@@ -200,6 +200,9 @@ def roi_rates_and_slopes(
     rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
     slants = found.slant_layers[..., chosen]  # [n, L, U]
     changes = layers[..., chosen] * found.by_depth[..., None] + slants * found.by_slant[..., None]
+    if AIR in detector.material_names:
+        air = chosen == detector.material_names.index(AIR)
+        changes -= jnp.where(air, layers[..., chosen] * found.by_walls[..., None], 0.0)
     of_scattered = (seen[..., None] * changes)[..., None] * shares[:, :, None]
     return rates, jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[:, :, None], axis=1)
 

@@ -46,6 +46,7 @@ class Scattered(NamedTuple):
     counts: jax.Array  # [..., L]
     by_depth: jax.Array  # [..., L] derivative of the counts by the depth
     by_slant: jax.Array  # [..., L]
+    by_walls: jax.Array  # [..., L] by the part of the depth that is walls, over the depth
 
 
 @lru_cache(maxsize=1)
@@ -63,7 +64,8 @@ def scattered_counts(
 
     Behind several layers with depths t_k it is that of the depth sum(t_k), with coefficients averaged over the layers
     with weights t_k; each layer's lie between those of a wall near the source and of one half way. Derivatives leave
-    out that these weights change, and take what changes for a wall.
+    out that these weights change, and take what changes for a wall: for
+    air, ``by_walls`` is to be taken off ``by_depth``.
 
     Args:
         attenuation_1_m: [L, M].
@@ -88,7 +90,7 @@ def scattered_counts(
     rising = 1.0 + depth * (jnp.where(depth < DEPTH_MAX, steep, 0.0) - 1.0)  # of depth x falling, over falling
     if way.shape is None:
         zero = jnp.zeros_like(depth)
-        return Scattered(layers, depth, slant_layers, slant, depth * falling, falling * rising, zero)
+        return Scattered(layers, depth, slant_layers, slant, depth * falling, falling * rising, zero, zero)
     k, small = k or constants(), 1e-9
     of_walls = 1.0 if air is None else 1.0 - layers[..., air] / (depth + small)
     missing, other = (1.0 - way.shape.spread)[..., None], way.shape.closed[..., None]
@@ -105,5 +107,5 @@ def scattered_counts(
     of_share += (1.0 - of_walls) * by_walls
     return Scattered(
         layers, depth, slant_layers, slant, depth * falling * share,
-        falling * (rising * share + of_share), -falling * straight * power * cosine,
+        falling * (rising * share + of_share), -falling * straight * power * cosine, falling * by_walls,
     )  # fmt: skip
