@@ -19,7 +19,8 @@ from cyclopts import App, Parameter
 from numpy.typing import NDArray
 
 from experiments.transport.bodies import Boxes, seen
-from experiments.transport.compare import ENERGIES_KEV, FAINT, detector_of, efficiency, modelled
+from experiments.transport.compare import ENERGIES_KEV, FAINT, detector_of, efficiency
+from experiments.transport.sites import Block, modelled, site_of, ways
 from experiments.transport.walk import Floats, Medium, medium
 from swarmsim.radiation import load_library
 
@@ -74,7 +75,7 @@ BUILDINGS = (
 
 @dataclass(frozen=True)
 class Case:
-    """One building, energy, place of the source and view: counts over those of the source without the building."""
+    """One building, energy, place of the source and view: counts over those of the source alone, without ground."""
 
     building: str
     energy_kev: float
@@ -82,7 +83,8 @@ class Case:
     view: str
     ground: bool
     slant: float  # metres of the line in the building over the thickness of a wall
-    bare: float  # counts of the bare source over those without ground
+    bare: float  # counts of the source without the building
+    bare_model: float
     uncollided: float
     monte_carlo: float
     error: float
@@ -104,6 +106,14 @@ def boxes(building: Building) -> Floats:
     if building.floor:
         found.append(((-x, -y, 0.0), (x, y, t)))
     return np.array(found)
+
+
+def blocks_of(building: Building) -> list[Block]:
+    """What the importer of sites makes of the building: a hollow box, or walls that are solid if it is open above."""
+    if building.roof:
+        (x, y), z = (0.5 * s for s in building.size_m[:2]), building.size_m[2]
+        return [Block((-x, -y, 0.0), (x, y, z), building.wall_m, building.material)]
+    return [Block(tuple(low), tuple(high), 0.0, building.material) for low, high in boxes(building)]
 
 
 def bodies_of(corners: Floats, ground: bool) -> Boxes:
@@ -145,6 +155,7 @@ class Runs:
             for name in names
         }
         views = np.array(list(VIEWS_M.values()))
+        number = ENERGIES_KEV.index(energy)
         for building in BUILDINGS:
             corners, walls = boxes(building), tables[building.material]
             for place, from_middle in (("middle", 0.0), ("by the wall", 0.5 * building.size_m[0] - FROM_WALL_M)):
@@ -155,12 +166,21 @@ class Runs:
                     if ground:
                         alone = bodies_of(corners[:0], True)
                         bare = np.sum(self._seen((walls, tables["soil"]), alone, energy, source, views)[:2], axis=0)
+                    model, bare_model = (
+                        self._modelled(number, blocks, ground, source, views) for blocks in (blocks_of(building), [])
+                    )
                     for v, view in enumerate(VIEWS_M):
-                        way = crossed(corners, source, views[v])
-                        model = sum(modelled(self.detector, ENERGIES_KEV.index(energy), {building.material: way}))
-                        direct, scattered, error = tally[:, v] / bare[v]
-                        yield Case(building.name, energy, place, view, ground, way[0] / building.wall_m, float(bare[v]),
-                                   direct, direct + scattered, error, model)  # fmt: skip
+                        slant = crossed(corners, source, views[v])[0] / building.wall_m
+                        direct, scattered, error = tally[:, v]
+                        yield Case(building.name, energy, place, view, ground, slant, float(bare[v]), bare_model[v],
+                                   direct, direct + scattered, error, model[v])  # fmt: skip
+
+    def _modelled(
+        self, number: int, blocks: list[Block], ground: bool, source: Floats, views: Floats
+    ) -> NDArray[np.float64]:
+        site = site_of(blocks, self.detector.material_names, ground)
+        way = ways(site, jnp.asarray(source, jnp.float32), jnp.asarray(views, jnp.float32))
+        return np.sum(np.asarray(modelled(self.detector, number, way), np.float64), axis=0)
 
     def _seen(
         self, media: tuple[Medium, ...], bodies: Boxes, energy: float, source: Floats, views: Floats

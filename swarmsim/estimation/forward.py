@@ -15,7 +15,7 @@ from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import registered_share, roi_rates_and_slopes
 from swarmsim.site import Site, sample
-from swarmsim.site.rays import Crossed, crossed_from
+from swarmsim.site.rays import Crossed, crossed_from, nothing_crossed, stretched
 
 LEAST_ABOVE_M = 0.2  # height of a crystal above the ground
 EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
@@ -142,12 +142,12 @@ def ways_from(problem: Problem, place: jax.Array) -> Ways:
     position, materials = position_of(problem.site, place), len(problem.site.material_names)
 
     def of_span(span: Span, nodes: Nodes) -> Crossed:
-        zero = jnp.zeros((nodes.position_m.shape[0], materials))
+        n = nodes.position_m.shape[0]
         used = jnp.any(problem.measurements.valid[span[0] : span[1]])
         return either(
             used,
             lambda: crossed_from(problem.site, position, nodes.position_m),
-            lambda: Crossed(length_m=zero, place=zero),
+            lambda: nothing_crossed(n, materials),
         )
 
     crossed = tuple(of_span(span, nodes) for span, nodes in zip(problem.spans, problem.nodes, strict=True))
@@ -164,7 +164,7 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) 
     source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
     parts = []
     for span, nodes, crossed in zip(problem.spans, problem.nodes, ways.crossed, strict=True):
-        way = Crossed(length_m=crossed.length_m * factors, place=crossed.place)
+        way = stretched(crossed, factors)
 
         def seen(span: Span = span, nodes: Nodes = nodes, way: Crossed = way) -> Rates:
             return _rates_of_span(problem, span, nodes, source, way)

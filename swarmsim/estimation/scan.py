@@ -8,16 +8,19 @@ up to the direction to the crystal, so that both are matrix products: (points x 
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from swarmsim.estimation.fit import Others, Unknowns, linearised, normal_equations
 from swarmsim.estimation.forward import Problem, detector_of, padded, silent
-from swarmsim.pytree import pytree
+from swarmsim.pytree import on_device, pytree
 from swarmsim.radiation.detector import Detector, Source
+from swarmsim.radiation.ground import basis
 from swarmsim.radiation.rate import roi_rates_and_slopes
-from swarmsim.site.rays import Crossed
+from swarmsim.site.rays import Crossed, Shape
 
-NODES_M = (3.0, 30.0, 100.0)
+NODES_M = (3.0, 10.0, 30.0, 100.0)
 """Distances at which the rates are computed; rates times squared distance are linear between them."""
+HEIGHT_M = 1.0  # of a source above the ground, for what the ground scatters
 SINE = 0.7071  # of the angle between the crystal's axis and the direction to the source
 LEAST_M = 3.0  # closer windows count as if they were this far: where a source is near, the grid is too coarse for them
 
@@ -32,13 +35,16 @@ class Scanned:
 
 
 def open_rates(detector: Detector, nuclides: int, air: int) -> jax.Array:
-    """Counts/s per Bq times squared distance [N, nodes, R] in air; ``air`` is its number among the materials."""
+    """Counts/s per Bq times squared distance [N, nodes, R] over ground; ``air`` is its number among materials."""
     distance = jnp.array(NODES_M)
     zero = jnp.zeros_like(distance)
     place = jnp.stack([distance * SINE, zero, distance * (1.0 - SINE**2) ** 0.5], axis=-1)
     up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), place.shape)
     length = jnp.zeros((len(NODES_M), len(detector.material_names))).at[:, air].set(distance)
-    way = Crossed(length_m=length, place=jnp.full_like(length, 0.5))
+    far, none = np.array(NODES_M), jnp.zeros_like(distance)
+    ground = on_device(basis(HEIGHT_M, HEIGHT_M + far * (1.0 - SINE**2) ** 0.5, far * SINE))
+    shape = Shape(thin_m=length, spread=none + 1.0, closed=none, ground=ground)
+    way = Crossed(length_m=length, place=jnp.full_like(length, 0.5), shape=shape)
 
     def of(nuclide: jax.Array) -> jax.Array:
         source = Source(position_m=jnp.zeros(3), activity_bq=jnp.ones(()), nuclide=nuclide)

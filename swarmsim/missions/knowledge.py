@@ -28,6 +28,7 @@ from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.rate import spectrum_rate
 from swarmsim.sensors.radiation import length_factors, sensitivity_factor
 from swarmsim.site import crossed
+from swarmsim.site.rays import stretched
 from swarmsim.world.emission import sources_at
 from swarmsim.world.model import World
 
@@ -178,8 +179,7 @@ def expected_spectrum(
         sources = sources_at(world.sources, world.emission, time_s, poses_at(trail, time_s))
 
         def of_source(source: Source) -> jax.Array:
-            way = crossed(site, source.position_m, position)
-            way = replace(way, length_m=way.length_m * lengths)
+            way = stretched(crossed(site, source.position_m, position), lengths)
             return sensitivity * spectrum_rate(detector, source, way, position, axis)
 
         natural = background_factor(background, site, key, position, detector.background_height_m)

@@ -58,6 +58,9 @@ def coarse(detector: Detector, lines: int, materials: tuple[str, ...]) -> Detect
         peak_rois=f32(averaged("peak_rois", 0)),
         scattered_bins=f32(np.ones((len(energy), 1, 1, most, 1))),
         scattered_rois=f32(averaged("scattered_rois", 2)[:, :, columns]),
+        ground=f32(averaged("ground", 0)),
+        ground_bins=f32(np.ones((len(energy), most, 1))),
+        ground_rois=f32(averaged("ground_rois", 0)),
         line_energy_kev=f32(averaged("line_energy_kev", 0)),
     )
 

@@ -16,6 +16,7 @@ from swarmsim.radiation import scattering
 from swarmsim.radiation.attenuation import linear_attenuation
 from swarmsim.radiation.crystal import ENERGIES_KEV
 from swarmsim.radiation.cylinder import NEAR_TABLES, fit_effective_area, near_tables
+from swarmsim.radiation.ground import from_ground
 from swarmsim.radiation.library import Library
 from swarmsim.radiation.response import (
     SIGMA_PER_FWHM,
@@ -65,11 +66,14 @@ class Detector:
     near_share: jax.Array  # [N, L, NEAR_TABLES] weights of the tables for each line
     attenuation_1_m: jax.Array  # [N, L, M]
     scatter_1_m: jax.Array  # [N, positions, COEFFICIENTS, L, M] attenuation times coefficients of scattered counts
+    ground: jax.Array  # [N, L, 2] coefficients of the counts from the ground (`swarmsim.radiation.ground`)
     peak_spectrum: jax.Array  # [N, L, channels] share of the counts of unscattered photons in each channel, sums to 1
     scattered_bins: jax.Array  # [N, depths, M, L, SPECTRUM_BINS] share of the scattered counts in each bin, sums to 1
+    ground_bins: jax.Array  # [N, L, SPECTRUM_BINS] share of the counts from the ground in each bin, sums to 1
     bin_spectrum: jax.Array  # [SPECTRUM_BINS, channels] spectra of photons of those bins, each sums to 1
     peak_rois: jax.Array  # [N, L, R] the spectra above added up in the regions of interest
     scattered_rois: jax.Array  # [N, depths, M, L, R] share of the scattered counts in each
+    ground_rois: jax.Array  # [N, L, R] share of the counts from the ground in each
     background_rois: jax.Array  # [R] cps, sums to background_cps
     grid_spectrum: jax.Array  # [grid, channels] spectra of lines half a resolution (FWHM) apart, each sums to 1
     background_spectrum: jax.Array  # [channels] cps, sums to background_cps
@@ -113,6 +117,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
     nodes = np.geomspace(mu.min(), max(mu.max(), 1.01 * mu.min()), NEAR_TABLES)
     axis = np.asarray(mount.axis) / np.linalg.norm(mount.axis)
     attenuation, coefficients, bins = _transport(library, energy, kind, counting, (radius, length))
+    ground, ground_bins = _ground(energy, kind, counting, (radius, length))
     f32 = on_device
     return Detector(
         radius_m=f32(radius),
@@ -131,11 +136,13 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         attenuation_1_m=f32(attenuation),
         scatter_1_m=f32(coefficients),
         scattered_bins=f32(bins),
+        ground=f32(ground),
+        ground_bins=f32(ground_bins),
         line_energy_kev=f32(energy),
         nuclide_names=library.nuclide_names,
         material_names=library.material_names,
         kind=kind,
-        **_spectra(spec, response, energy, bins),
+        **_spectra(spec, response, energy, bins, ground_bins),
     )
 
 
@@ -151,6 +158,7 @@ def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
     lines = int(np.max(np.sum(np.asarray(detector.yields)[rows] > 0, axis=1)))
     second = (
         "yields", "effective_area_m2", "near_share", "attenuation_1_m", "peak_spectrum", "peak_rois", "line_energy_kev",
+        "ground", "ground_bins", "ground_rois",
     )  # fmt: skip
     last_but_one = ("scatter_1_m", "scattered_bins", "scattered_rois")
     tables = {name: getattr(detector, name)[rows, :lines] for name in second}
@@ -211,6 +219,16 @@ def _transport(
     return attenuation[row], np.moveaxis(tables.scatter_1_m[row], 1, 3), np.moveaxis(bins[row], 1, 3)
 
 
+def _ground(energy: Floats, kind: str, counting: Counting, size: tuple[float, float]) -> tuple[Floats, Floats]:
+    """The fields ground and ground_bins of a detector."""
+    flat, row = np.unique(energy, return_inverse=True)
+    if kind == "paper_ideal":
+        return np.zeros((*energy.shape, 2)), np.full((*energy.shape, SPECTRUM_BINS), 1.0 / SPECTRUM_BINS)
+    found, counts = from_ground(flat, lambda e: _mean_area(counting, e, size))
+    shares = normalised(_rebinned(counts, scattering.bin_energies(flat)))
+    return found[row].reshape(*energy.shape, -1), shares[row].reshape(*energy.shape, -1)
+
+
 def _mean_area(counting: Counting, energy: Floats, size: tuple[float, float]) -> Floats:
     """Counts per photon and area [...] of photons that come from around, up to a factor.
 
@@ -224,16 +242,18 @@ def _mean_area(counting: Counting, energy: Floats, size: tuple[float, float]) ->
 
 def _energy_shares(counts: Floats, energies: Floats) -> Floats:
     """Shares [depths, k, SPECTRUM_BINS] of the scattered counts [k, d, BINS] by energy, at `SPECTRUM_DEPTHS`."""
-    edges = spectrum_edges()
+    rows = [int(np.argmin(np.abs(scattering.depths() - depth))) for depth in SPECTRUM_DEPTHS]
+    return normalised(np.stack([_rebinned(counts[:, row], energies) for row in rows]))
+
+
+def _rebinned(counts: Floats, energies: Floats) -> Floats:
+    """Counts [k, BINS] in bins with the middles ``energies`` [k, BINS] in those of the spectrum [k, SPECTRUM_BINS]."""
     relative = np.log(energies / scattering.CUT_KEV)  # [k, BINS] middles
     width = 2.0 * relative[:, :1]
     low, high = relative - 0.5 * width, relative + 0.5 * width
-    log_edges = np.log(edges / scattering.CUT_KEV)
+    log_edges = np.log(spectrum_edges() / scattering.CUT_KEV)
     below = np.clip((log_edges - low[..., None]) / (high - low)[..., None], 0.0, 1.0)
-    part = np.diff(below, axis=-1)  # [k, BINS, SPECTRUM_BINS]
-    rows = [int(np.argmin(np.abs(scattering.depths() - depth))) for depth in SPECTRUM_DEPTHS]
-    shares = np.stack([np.einsum("kb,kbs->ks", counts[:, row], part) for row in rows])
-    return normalised(shares)
+    return np.einsum("kb,kbs->ks", counts, np.diff(below, axis=-1))
 
 
 def spectrum_edges() -> Floats:
@@ -241,7 +261,9 @@ def spectrum_edges() -> Floats:
     return np.geomspace(scattering.CUT_KEV, 3000.0, SPECTRUM_BINS + 1)
 
 
-def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins: Floats) -> dict[str, Any]:
+def _spectra(
+    spec: DetectorSpec, response: Response | None, energy: Floats, bins: Floats, ground_bins: Floats
+) -> dict[str, Any]:
     """The fields of a detector that have channels; a counter without energy resolution has one channel."""
     f32 = on_device
     if response is None:
@@ -250,6 +272,7 @@ def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins
             "bin_spectrum": f32(np.ones((SPECTRUM_BINS, 1))),
             "peak_rois": f32(np.ones((*energy.shape, 1))),
             "scattered_rois": f32(np.ones((*bins.shape[:-1], 1))),
+            "ground_rois": f32(np.ones((*energy.shape, 1))),
             "background_rois": f32(np.array([spec.background.rate_cps])),
             "grid_spectrum": f32(np.ones((1, 1))),
             "background_spectrum": f32(np.array([spec.background.rate_cps])),
@@ -270,6 +293,7 @@ def _spectra(spec: DetectorSpec, response: Response | None, energy: Floats, bins
         "grid_spectrum": f32(normalised(line_spectra(response, _line_grid(response)))),
         "peak_rois": f32((peaks @ rois)[back].reshape(*energy.shape, -1)),
         "scattered_rois": f32(bins @ of_bins @ rois),
+        "ground_rois": f32(ground_bins @ of_bins @ rois),
         "background_rois": f32(background @ rois),
         "background_spectrum": f32(background),
         "energy_kev": f32(response.channel_centre_kev),

@@ -10,6 +10,7 @@ from swarmsim.pytree import on_device
 from swarmsim.radiation import scattering
 from swarmsim.radiation.cylinder import NEAR_COLUMNS, NEAR_ROWS, NEAR_TABLES
 from swarmsim.radiation.detector import SPECTRUM_BINS, Detector, lines_of
+from swarmsim.radiation.ground import from_ground
 from swarmsim.radiation.library import Library
 
 Floats = NDArray[np.float64]
@@ -50,6 +51,7 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
     """
     energy, yields = lines_of(library)
     tables = scattering.transport(library.materials, energy, lambda e: per_fluence(quantity, e))
+    ground, _ = from_ground(tables.energy_kev, lambda e: per_fluence(quantity, e))
     area = np.zeros((*energy.shape, 5))
     area[..., 0] = per_fluence(quantity, energy) * 1e-4 * MICRO_PER_HOUR
     f32, zero = on_device, on_device(0.0)
@@ -72,6 +74,9 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
         near_share=f32(np.full((*energy.shape, NEAR_TABLES), 1 / NEAR_TABLES)),
         attenuation_1_m=f32(tables.attenuation_1_m[tables.row]),
         scatter_1_m=f32(np.moveaxis(tables.scatter_1_m[tables.row], 1, 3)),
+        ground=f32(ground[tables.row]),
+        ground_bins=f32(np.full((*energy.shape, SPECTRUM_BINS), 1 / SPECTRUM_BINS)),
+        ground_rois=f32(np.ones((*energy.shape, 1))),
         peak_spectrum=f32(np.ones((*energy.shape, 1))),
         scattered_bins=f32(bins),
         peak_rois=f32(np.ones((*energy.shape, 1))),

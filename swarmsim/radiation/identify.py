@@ -2,9 +2,9 @@
 
 The hypotheses: background only; one nuclide; two or three nuclides; something that the library does not hold, which is
 any non-negative sum of lines of the detector's own shape. Under each, the spectrum is a non-negative sum of templates:
-the background (amplitude and tilt free), and for each nuclide its spectrum bare, in air, and behind concrete, steel and
-lead (`swarmsim.radiation.templates`). All nuclides are fitted alone; each other is added to the best two, and a third
-to the best pair. The best of each number are fitted at a gain and a resolution of their own
+the background (amplitude and tilt free), and for each nuclide its spectrum bare, above the ground, in air, and behind
+concrete, steel and lead (`swarmsim.radiation.templates`). All nuclides are fitted alone; each other is added to the
+best two, and a third to the best pair. The best of each number are fitted at a gain and a resolution of their own
 (`swarmsim.radiation.fits`): those of one nuclide that is fitted to a mixture are not those of the mixture.
 Posterior = likelihood x Occam factor of each source's strength x prior, where each bin's deviance is reduced to account
 for the error of the templates. Free lines fit better than the truth does, by about a chi-squared number whose degrees

@@ -3,7 +3,7 @@
     rate = sum over lines of  A y A_eff(E, theta) G / (4 pi (r^2 + S^2)) (exp(-t) + scattered(t)),  t = sum mu_k x_k
 
 with activity A, effective area A_eff (the integral of the detection probability over the silhouette), near-field ratio
-G (`swarmsim.radiation.cylinder`), and the scattered counts of `swarmsim.radiation.scattering`.
+G (`swarmsim.radiation.cylinder`), and the scattered counts of `swarmsim.radiation.walls`.
 """
 
 import jax
@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.radiation.cylinder import direction_basis, near_ratio
-from swarmsim.radiation.detector import SPECTRUM_DEPTHS, Detector, Source
+from swarmsim.radiation.detector import AIR, SPECTRUM_DEPTHS, Detector, Source
 from swarmsim.radiation.poisson import poisson
-from swarmsim.radiation.scattering import DEPTH_MAX, DEPTH_SCALES, POSITIONS
+from swarmsim.radiation.walls import Scattered, scattered_counts
 from swarmsim.site.rays import Crossed
 
 
@@ -23,28 +23,45 @@ def line_rates(
     """Counts per second [L] of each line from unscattered photons, and [L] from scattered ones.
 
     ``way`` is what the line from the source to the crystal crosses, ``position_m`` [3] the crystal's centre and
-    ``axis`` [3] its unit axis, world ENU. Scattered counts behind several layers with optical depths t_k are those of
-    the depth sum(t_k), with coefficients averaged over the layers with weights t_k; each layer's lie between those of a
-    wall near the source and of one half way. Scattered photons come from the direction of the source.
+    ``axis`` [3] its unit axis, world ENU. Scattered photons (`swarmsim.radiation.walls`) come from the direction of the
+    source.
     """
-    direct, scattered = transmission(detector, source.nuclide, way)
+    direct, scattered, ground = _parts(detector, source, way, position_m, axis)
+    return direct, scattered + ground
+
+
+def _parts(
+    detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Counts per second [L] of photons that did not scatter, that scattered on the way, and that came by the ground."""
     seen = _seen(detector, source, position_m, axis)
-    return seen * direct, seen * scattered
+    direct, scattered = transmission(detector, source.nuclide, way)
+    return seen * direct, seen * scattered, seen * (direct + scattered) * from_ground(detector, source.nuclide, way)
+
+
+def from_ground(detector: Detector, nuclide: jax.Array, way: Crossed) -> jax.Array:
+    """Counts [..., L] of photons that the ground scatters over those of the photons from the source.
+
+    Walls hold back the former as the latter.
+    """
+    if way.shape is None or detector.kind == "paper_ideal":
+        return jnp.zeros((*way.length_m.shape[:-1], detector.yields.shape[1]))
+    share = way.shape.ground[..., None, :] * detector.ground[nuclide]
+    return share[..., 0] + share[..., 1]
 
 
 def transmission(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[jax.Array, jax.Array]:
-    """Unscattered and scattered counts [L] behind matter, relative to the counts without it."""
-    depth = detector.attenuation_1_m[nuclide] @ way.length_m
-    direct = jnp.exp(-depth)
+    """Unscattered counts [L] behind matter and those that it scatters, relative to the counts without it."""
     if detector.kind == "paper_ideal":
+        direct = jnp.exp(-detector.attenuation_1_m[nuclide] @ way.length_m)
         return direct, jnp.zeros_like(direct)
-    first, last = POSITIONS
-    near = jnp.clip((last - way.place) / (last - first), 0.0, 1.0)
-    lengths = jnp.stack([near * way.length_m, (1.0 - near) * way.length_m])  # [positions, M]
-    c = jnp.einsum("pclm,pm->cl", detector.scatter_1_m[nuclide], lengths) / (depth + 1e-9)
-    t = jnp.minimum(depth, DEPTH_MAX)
-    growth = c[0] + c[1] * t + c[2] * jnp.log1p(t / DEPTH_SCALES[0]) + c[3] * jnp.log1p(t / DEPTH_SCALES[1])
-    return direct, depth * jnp.exp(growth - depth)
+    found = _scattered(detector, nuclide, way)
+    return jnp.exp(-found.slant), found.counts
+
+
+def _scattered(detector: Detector, nuclide: jax.Array, way: Crossed) -> Scattered:
+    air = detector.material_names.index(AIR) if AIR in detector.material_names else None
+    return scattered_counts(detector.attenuation_1_m[nuclide], detector.scatter_1_m[nuclide], air, way)
 
 
 def _seen(detector: Detector, source: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
@@ -137,17 +154,18 @@ def spectrum_rate(
     detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
 ) -> jax.Array:
     """Counts per second in each channel [channels] that ``source`` adds; they sum to `net_rate`."""
-    direct, scattered = line_rates(detector, source, way, position_m, axis)
+    direct, scattered, ground = _parts(detector, source, way, position_m, axis)
     shares = scattered_shares(detector, source.nuclide, way)
-    bins = jnp.einsum("l,lb->b", scattered, shares)
+    bins = jnp.einsum("l,lb->b", scattered, shares) + ground @ detector.ground_bins[source.nuclide]
     return direct @ detector.peak_spectrum[source.nuclide] + bins @ detector.bin_spectrum
 
 
 def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array) -> jax.Array:
     """Counts per second in each region of interest [R] that ``source`` adds; they sum to `net_rate`."""
-    direct, scattered = line_rates(detector, source, way, position_m, axis)
+    direct, scattered, ground = _parts(detector, source, way, position_m, axis)
     shares = _shares(detector, source.nuclide, way, detector.scattered_rois)
-    return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares)
+    of_ground = ground @ detector.ground_rois[source.nuclide]
+    return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares) + of_ground
 
 
 def roi_rates_and_slopes(
@@ -171,31 +189,29 @@ def roi_rates_and_slopes(
     """
     nuclide, chosen = source.nuclide, jnp.array(by, jnp.int32)
     seen = jax.vmap(lambda place, along: _seen(detector, source, place, along))(position_m, axis)  # [n, L]
-    layers = way.length_m[:, None, :] * detector.attenuation_1_m[nuclide]  # [n, L, M]
-    depth = jnp.sum(layers, axis=-1)
-    direct = seen * jnp.exp(-depth)
     peaks = detector.peak_rois[nuclide]  # [L, R]
     if detector.kind == "paper_ideal":
-        slopes = -jnp.einsum("nlu,nl,lr->nur", layers[..., chosen], direct, peaks)
-        return direct @ peaks, slopes
-    first, last = POSITIONS
-    near = jnp.clip((last - way.place) / (last - first), 0.0, 1.0)
-    lengths = jnp.stack([near * way.length_m, (1.0 - near) * way.length_m], axis=1)  # [n, positions, M]
-    c = jnp.einsum("pclm,npm->ncl", detector.scatter_1_m[nuclide], lengths) / (depth + 1e-9)[:, None]
-    t = jnp.minimum(depth, DEPTH_MAX)
-    growth = c[:, 0] + c[:, 1] * t + c[:, 2] * jnp.log1p(t / DEPTH_SCALES[0]) + c[:, 3] * jnp.log1p(t / DEPTH_SCALES[1])
-    steep = c[:, 1] + c[:, 2] / (DEPTH_SCALES[0] + t) + c[:, 3] / (DEPTH_SCALES[1] + t)
-    falling = seen * jnp.exp(growth - depth)
-    scattered = depth * falling
-    by_depth = falling * (1.0 + depth * (jnp.where(depth < DEPTH_MAX, steep, 0.0) - 1.0))
+        lengths = way.length_m[:, None, :] * detector.attenuation_1_m[nuclide]
+        direct = seen * jnp.exp(-jnp.sum(lengths, axis=-1))
+        return direct @ peaks, -jnp.einsum("nlu,nl,lr->nur", lengths[..., chosen], direct, peaks)
+    found = _scattered(detector, nuclide, way)  # [n, L]
+    layers, depth = found.layers, found.depth
+    direct = seen * jnp.exp(-found.slant)
     low, high = SPECTRUM_DEPTHS
     deep = jnp.clip((depth - low) / (high - low), 0.0, 1.0)
     part = jnp.where(depth[..., None] > 1e-6, layers / jnp.maximum(depth, 1e-6)[..., None], 1.0 / layers.shape[-1])
     mixed = jnp.stack([(1.0 - deep)[..., None] * part, deep[..., None] * part], axis=2)  # [n, L, depths, M]
     shares = jnp.einsum("nldm,dmlr->nlr", mixed, detector.scattered_rois[nuclide])
-    rates = direct @ peaks + jnp.einsum("nl,nlr->nr", scattered, shares)
-    each = by_depth[..., None] * shares - direct[..., None] * peaks
-    return rates, jnp.sum(layers[..., chosen, None] * each[:, :, None], axis=1)
+    ground = from_ground(detector, nuclide, way)[..., None] * detector.ground_rois[nuclide]
+    shares, peaks = shares + ground, peaks + ground  # [n, L, R]
+    rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
+    slants = found.slant_layers[..., chosen]  # [n, L, U]
+    changes = layers[..., chosen] * found.by_depth[..., None] + slants * found.by_slant[..., None]
+    if AIR in detector.material_names:
+        air = chosen == detector.material_names.index(AIR)
+        changes -= jnp.where(air, layers[..., chosen] * found.by_walls[..., None], 0.0)
+    of_scattered = (seen[..., None] * changes)[..., None] * shares[:, :, None]
+    return rates, jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[:, :, None], axis=1)
 
 
 def observed_rois(detector: Detector, net_cps: jax.Array, background: jax.Array | float = 1.0) -> jax.Array:
@@ -215,7 +231,8 @@ def scattered_shares(detector: Detector, nuclide: jax.Array, way: Crossed) -> ja
 
 
 def _shares(detector: Detector, nuclide: jax.Array, way: Crossed, tables: jax.Array) -> jax.Array:
-    layers = detector.attenuation_1_m[nuclide] * way.length_m  # [L, M]
+    thin_m = way.length_m if way.shape is None else way.shape.thin_m
+    layers = detector.attenuation_1_m[nuclide] * thin_m  # [L, M]
     depth = jnp.sum(layers, axis=1)
     first, last = SPECTRUM_DEPTHS
     deep = jnp.clip((depth - first) / (last - first), 0.0, 1.0)

@@ -13,8 +13,8 @@ import numpy as np
 
 from swarmsim.radiation.cylinder import direction_basis
 from swarmsim.radiation.detector import AIR, Detector
-from swarmsim.radiation.rate import scattered_shares, transmission
-from swarmsim.site.rays import Crossed
+from swarmsim.radiation.rate import from_ground, scattered_shares, transmission
+from swarmsim.site.rays import Crossed, Shape
 
 SHIELDS = ("concrete", "steel", "lead")
 DEPTHS = (0.3, 1.3, 4.0)
@@ -42,19 +42,20 @@ def templates(detector: Detector) -> Templates:
     """Templates of every nuclide of a detector with energy resolution."""
     names = detector.material_names
     walls = [names.index(name) for name in SHIELDS if name in names] or [0]
-    layers = [(wall, depth, 0.0) for wall in walls for depth in DEPTHS]
+    layers = [(wall, depth, 0.0, 0.0) for wall in walls for depth in DEPTHS] + [(walls[0], 0.0, 0.0, 1.0)]
     if AIR in names:
-        layers += [(walls[0], 0.0, length) for length in AIR_M]
-        layers += [(wall, DEPTHS[-1], AIR_M[-1]) for wall in walls]
+        layers += [(walls[0], 0.0, length, 0.0) for length in AIR_M]
+        layers += [(wall, DEPTHS[-1], AIR_M[-1], 0.0) for wall in walls]
     is_air = jnp.array([name == AIR for name in names])
 
     def of_nuclide(number: jax.Array) -> jax.Array:
         def behind(layer: jax.Array) -> jax.Array:
             wall = layer[0].astype(jnp.int32)
             thickness = thickness_m(detector, number, wall, layer[1])
-            return shielded(detector, number, thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air)
+            length_m = thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air
+            return shielded(detector, number, length_m, layer[3])
 
-        return jax.lax.map(behind, jnp.asarray([(walls[0], 0.0, 0.0), *layers], jnp.float32))
+        return jax.lax.map(behind, jnp.asarray([(walls[0], 0.0, 0.0, 0.0), *layers], jnp.float32))
 
     slope = TILT * tilt(detector.energy_kev)
     background = detector.background_spectrum * jnp.stack([1.0 - slope, 1.0 + slope])
@@ -68,12 +69,17 @@ def tilt(energy_kev: jax.Array) -> jax.Array:
     return jnp.clip((2.0 * jnp.log(energy_kev) - low - high) / (high - low), -1.0, 1.0)
 
 
-def shielded(detector: Detector, nuclide: jax.Array, length_m: jax.Array) -> jax.Array:
-    """Spectrum [channels] of a nuclide end on behind ``length_m`` [M] of each material half way, up to a factor."""
-    way = Crossed(length_m=length_m, place=jnp.full(len(detector.material_names), 0.5))
+def shielded(detector: Detector, nuclide: jax.Array, length_m: jax.Array, above: jax.Array) -> jax.Array:
+    """Spectrum [channels] of a nuclide end on behind ``length_m`` [M] of each material half way, up to a factor.
+
+    ``above`` [] is 1 for a source on the ground that is seen from above, 0 without a ground.
+    """
+    shape = Shape(thin_m=length_m, spread=jnp.ones(()), closed=jnp.zeros(()), ground=jnp.stack([above, above]))
+    way = Crossed(length_m=length_m, place=jnp.full(len(detector.material_names), 0.5), shape=shape)
     lines = _bare_lines(detector, nuclide)
     direct, scattered = transmission(detector, nuclide, way)
-    bins = (lines * scattered) @ scattered_shares(detector, nuclide, way)
+    of_ground = (lines * (direct + scattered) * from_ground(detector, nuclide, way)) @ detector.ground_bins[nuclide]
+    bins = (lines * scattered) @ scattered_shares(detector, nuclide, way) + of_ground
     return (lines * direct) @ detector.peak_spectrum[nuclide] + bins @ detector.bin_spectrum
 
 

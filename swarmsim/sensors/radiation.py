@@ -14,6 +14,7 @@ from swarmsim.radiation.background import BackgroundField, background_factor
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import draw_counts, exposure_of, observed_rois, roi_rates
 from swarmsim.site import Site, crossed
+from swarmsim.site.rays import stretched
 from swarmsim.vehicles.state import RigidState
 
 
@@ -122,8 +123,7 @@ def source_rate(
     """
 
     def one(source: Source) -> jax.Array:
-        way = crossed(site, source.position_m, position_m)
-        way = replace(way, length_m=way.length_m * lengths)
+        way = stretched(crossed(site, source.position_m, position_m), jnp.asarray(lengths))
         return roi_rates(detector, source, way, position_m, axis)
 
     return jnp.sum(jax.vmap(one)(sources), axis=0)

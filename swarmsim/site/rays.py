@@ -11,7 +11,7 @@ import numpy as np
 from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
-from swarmsim.site.model import Obstacles, Site
+from swarmsim.site.model import Obstacles, Site, sample
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
 BLOCK = 1024  # segments intersected with all boxes at a time, so that the result fits the cache
@@ -20,11 +20,36 @@ _PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is p
 
 
 @pytree
+class Shape:
+    """What decides how much of the photons that scatter in walls arrives: see `swarmsim.radiation.scattering`."""
+
+    thin_m: jax.Array  # [..., M] length the shortest way through each piece of matter that is crossed; <= length_m
+    spread: jax.Array  # [...] 0..1: part of an infinite wall's scattered photons that come from a wall of its size
+    closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box, whose other walls scatter too
+    ground: jax.Array  # [..., 2] how the ground shines, see `mirrored`
+
+
+@pytree
 class Crossed:
     """Materials along a segment, in the order of ``Site.material_names``."""
 
     length_m: jax.Array  # [..., M]
     place: jax.Array  # [..., M] mean place of the material along the segment, 0 at its start and 1 at its end
+    shape: Shape | None = None  # None: walls are infinitely wide, and crossed squarely
+
+
+def stretched(way: Crossed, factors: jax.Array) -> Crossed:
+    """The same with each material [M] so many times as thick."""
+    shape = None if way.shape is None else replace(way.shape, thin_m=way.shape.thin_m * factors)
+    return replace(way, length_m=way.length_m * factors, shape=shape)
+
+
+def nothing_crossed(n: int, materials: int) -> Crossed:
+    """Of n segments that have no length."""
+    zero, row = jnp.zeros((n, materials)), jnp.zeros(n)
+    return Crossed(
+        length_m=zero, place=zero, shape=Shape(thin_m=zero, spread=row, closed=row, ground=jnp.zeros((n, 2)))
+    )
 
 
 def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
@@ -40,9 +65,9 @@ def crossed(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
 
     Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
     The terrain is crossed exactly too (`swarmsim.site.terrain_crossing`). Lengths are continuous in both ends and
-    differentiable almost everywhere; places are taken as constant by derivatives. Where obstacles overlap, the lengths
-    are scaled so that their sum does not exceed the distance. The remaining distance is that through ``air`` if the
-    table has it, and then the sum equals the distance.
+    differentiable almost everywhere; of the rest only ``thin_m`` is, the others are constants to derivatives. Where
+    obstacles overlap, the lengths are scaled so that their sum does not exceed the distance. The remaining distance is
+    that through ``air`` if the table has it, and then the sum equals the distance.
     """
     return _crossed(site, above_of(site), a, b)
 
@@ -57,19 +82,38 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Bo
     squared = jnp.sum(direction * direction)
     distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
-    fractions, moments = (boxes or _all_boxes)(site, a, direction)
+    found = (boxes or _all_boxes)(site, a, direction, distance)
+    fractions, moments, thin = found.share, found.moment, found.thin
     # A function with its own derivative takes no arrays of the host, as the values of a world are: add nothing to them.
     soil, soil_place = share_below(site, above, jnp.add(a, 0.0), jnp.add(b, 0.0))
     ground = materials == site.ground_material
-    fractions = fractions + jnp.where(ground, soil, 0.0)
+    fractions, thin = (x + jnp.where(ground, soil, 0.0) for x in (fractions, thin))
+    walls = jnp.maximum(jnp.sum(thin), 1e-9)
     moments = moments + jnp.where(ground, jax.lax.stop_gradient(soil * soil_place), 0.0)
     place = jnp.where(fractions > 1e-9, moments / jnp.maximum(fractions, 1e-9), 0.5)
     total = jnp.sum(fractions)
-    fractions = fractions / jnp.maximum(total, 1.0)
+    fractions, thin = (x / jnp.maximum(total, 1.0) for x in (fractions, thin))
     if "air" in site.material_names:
-        rest = jnp.maximum(1.0 - total, 0.0)
-        fractions = fractions + jnp.where(materials == site.material_names.index("air"), rest, 0.0)
-    return Crossed(length_m=distance * fractions, place=jax.lax.stop_gradient(jnp.clip(place, 0.0, 1.0)))
+        rest = jnp.where(materials == site.material_names.index("air"), jnp.maximum(1.0 - total, 0.0), 0.0)
+        fractions, thin = fractions + rest, thin + rest
+    spread, closed = 1.0 - jnp.sum(found.narrow) / walls, jnp.sum(found.closed) / walls
+    constant = (jnp.clip(place, 0.0, 1.0), spread, closed, mirrored(site, a, b))
+    place, spread, closed, shines = jax.lax.stop_gradient(constant)
+    shape = Shape(thin_m=distance * thin, spread=spread, closed=closed, ground=shines)
+    return Crossed(length_m=distance * fractions, place=place, shape=shape)
+
+
+def mirrored(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
+    """(r / r')^2 (sqrt(u), u) [2] of a segment above the ground: `swarmsim.radiation.ground`.
+
+    r is the distance of its ends, r' that of the one from the other's mirror image below the ground, u the sine of the
+    image's elevation; by the ends' heights above the ground below each.
+    """
+    one, other = (jnp.maximum(x[2] - sample(site.terrain_m, site, x[:2]), 0.0) for x in (a, b))
+    level2 = jnp.square(b[0] - a[0]) + jnp.square(b[1] - a[1])
+    both, image2 = one + other, level2 + jnp.square(one + other) + 1e-12
+    u, ratio = both * jax.lax.rsqrt(image2), (level2 + jnp.square(one - other)) / image2
+    return ratio * jnp.stack([jnp.sqrt(u), u])
 
 
 def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
@@ -86,7 +130,7 @@ def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     size = min(BLOCK, n)
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
     found = jax.lax.map(jax.vmap(lambda end: _crossed(padded, above, a, end)), ends)
-    return jax.tree.map(lambda x: x.reshape(-1, x.shape[-1])[:n], found)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
 
 
 def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = None) -> Crossed:
@@ -109,38 +153,49 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
     return found
 
 
-Boxes = Callable[[Site, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
-"""Fractions [M] of a segment in the boxes of each material, and the integrals [M] of the place over them."""
+@pytree
+class _Found:
+    """What a segment crosses of each box [K], or of the boxes of each material [M]; lengths over the segment's."""
+
+    share: jax.Array
+    moment: jax.Array  # integral of the place over the part inside
+    thin: jax.Array  # the shortest way through the box's matter
+    narrow: jax.Array  # that, times the missing part of an infinite wall
+    closed: jax.Array  # that, for a box that one end of the segment lies in
 
 
-def _all_boxes(site: Site, a: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+Boxes = Callable[[Site, jax.Array, jax.Array, jax.Array], _Found]
+"""What a segment meets [M]; it starts at a place [3], and is given as a vector [3] and that vector's length []."""
+
+
+def _all_boxes(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
     one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
     # Matrix product: a masked sum would dominate the cost.
-    share, moment = _box_fractions(site.obstacles, a, direction)
-    stacked = jnp.stack([share, jax.lax.stop_gradient(moment)])
-    fractions, moments = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
-    return fractions, moments
+    found = _of_boxes(site.obstacles, a, direction, distance)
+    stacked = jnp.stack([found.share, jax.lax.stop_gradient(found.moment), found.thin])
+    share, moment, thin = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
+    return _Found(share=share, moment=moment, thin=thin, narrow=found.narrow, closed=found.closed)
 
 
-def _box_after_box(site: Site, a: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
     boxes, materials = site.obstacles, jnp.arange(len(site.material_names), dtype=jnp.int32)
 
-    def add(k: jax.Array, found: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def add(k: jax.Array, found: _Found) -> _Found:
         box = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 1), boxes)
-        share, moment = _box_fractions(box, a, direction)
+        met = _of_boxes(box, a, direction, distance)
         own = box.material == materials
-        return found[0] + jnp.where(own, share, 0.0), found[1] + jnp.where(own, moment, 0.0)
+        share, moment, thin = (jnp.where(own, x, 0.0) for x in (met.share, met.moment, met.thin))
+        each = _Found(share=share, moment=moment, thin=thin, narrow=met.narrow, closed=met.closed)
+        return jax.tree.map(jnp.add, found, each)
 
-    nothing = jnp.zeros(materials.shape)
-    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, (nothing, nothing))
+    zero, one = jnp.zeros(materials.shape), jnp.zeros(1)
+    nothing = _Found(share=zero, moment=zero, thin=zero, narrow=one, closed=one)
+    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, nothing)
 
 
-def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Fraction [K] of the segment inside the material of each box, and the integral [K] of the place over it.
-
-    Written per component, so that the boxes are the vectorised axis.
-    """
+def _of_boxes(obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
+    """What the segment crosses of each box [K]. Written per component, so that the boxes are the vectorised axis."""
     offset = a - obstacles.centre_m
     c, s = obstacles.axis[:, 0], obstacles.axis[:, 1]
     start = (c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2])
@@ -155,19 +210,50 @@ def _box_fractions(obstacles: Obstacles, a: jax.Array, direction: jax.Array) -> 
     reach = [jnp.abs(i) for i in inverse]
     outer = [obstacles.half_extent_m[:, k] for k in range(3)]
     inner = [half - obstacles.wall_m for half in outer]
-    hollow = (obstacles.wall_m > 0.0) & (jnp.minimum(jnp.minimum(inner[0], inner[1]), inner[2]) > 0.0)
-    whole, of_whole = _slab_fraction(middle, reach, outer)
-    empty, of_empty = _slab_fraction(middle, reach, inner)
-    return whole - jnp.where(hollow, empty, 0.0), of_whole - jnp.where(hollow, of_empty, 0.0)
+    hollow = (obstacles.wall_m > 0.0) & (_least(inner) > 0.0)
+    (enter, leave), (whole, of_whole) = _slab_fraction(middle, reach, outer)
+    _, (empty, of_empty) = _slab_fraction(middle, reach, inner)
+    share = whole - jnp.where(hollow, empty, 0.0)
+    moment = of_whole - jnp.where(hollow, of_empty, 0.0)
+    first, last = _most(enter), _least(leave)
+    within = (first < 0.0) != (last > 1.0)
+    shortest = jnp.where(hollow, jnp.where(within, 1.0, 2.0) * obstacles.wall_m, 2.0 * _least(outer))
+    thin = jnp.minimum(share, shortest / jnp.maximum(distance, 1e-9))
+    # The face that the segment leaves the box by, or enters it by if it ends inside, and how far its edges are
+    at = jnp.where(last < 1.0, last, first)
+    faces = [jnp.where(last < 1.0, leave[k], enter[k]) == at for k in (0, 1)]
+    place = [x + at * d for x, d in zip(start, along, strict=True)]
+    (one, other), (wide, high) = (
+        (jnp.where(faces[0], x[1], x[0]), jnp.where(faces[0] | faces[1], x[2], x[1])) for x in (place, outer)
+    )
+    per_share = 1.0 / jnp.maximum(share, 1e-9)
+    mean = moment * per_share
+    scale = jnp.square(distance * thin * per_share * mean * (1.0 - mean)) + 1e-12
+    missing = 1.0 - _seen(one, wide, scale) * _seen(other, high, scale)
+    closed = jnp.where(hollow & within, thin, 0.0)
+    return _Found(share=share, moment=moment, thin=thin, narrow=thin * missing, closed=closed)
+
+
+def _seen(place: jax.Array, half: jax.Array, scale2: jax.Array) -> jax.Array:
+    """Part [K] of an infinite wall's scattered photons from a strip of it, -/+ ``half`` wide, around ``place``."""
+    ahead, behind = half - place, half + place
+    return 0.5 * (ahead * jax.lax.rsqrt(ahead * ahead + scale2) + behind * jax.lax.rsqrt(behind * behind + scale2))
+
+
+def _most(x: list[jax.Array]) -> jax.Array:
+    return jnp.maximum(jnp.maximum(x[0], x[1]), x[2])
+
+
+def _least(x: list[jax.Array]) -> jax.Array:
+    return jnp.minimum(jnp.minimum(x[0], x[1]), x[2])
 
 
 def _slab_fraction(
     middle: list[jax.Array], reach: list[jax.Array], half: list[jax.Array]
-) -> tuple[jax.Array, jax.Array]:
-    """Fraction [K] of the segments 0 <= t <= 1 inside boxes with slabs at middle -/+ reach half, and its moment [K]."""
+) -> tuple[tuple[list[jax.Array], list[jax.Array]], tuple[jax.Array, jax.Array]]:
+    """Where lines enter and leave slabs at middle -/+ reach half; the share [K] of 0 <= t <= 1 in all, its moment."""
     enter = [m - r * h for m, r, h in zip(middle, reach, half, strict=True)]
     leave = [m + r * h for m, r, h in zip(middle, reach, half, strict=True)]
-    first = jnp.maximum(jnp.maximum(jnp.maximum(enter[0], enter[1]), enter[2]), 0.0)
-    last = jnp.minimum(jnp.minimum(jnp.minimum(leave[0], leave[1]), leave[2]), 1.0)
+    first, last = jnp.maximum(_most(enter), 0.0), jnp.minimum(_least(leave), 1.0)
     share = jnp.maximum(last - first, 0.0)
-    return share, share * 0.5 * (jnp.minimum(first, 1.0) + jnp.maximum(last, 0.0))
+    return (enter, leave), (share, share * 0.5 * (jnp.minimum(first, 1.0) + jnp.maximum(last, 0.0)))

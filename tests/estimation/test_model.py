@@ -92,11 +92,12 @@ def cone(at):
 
 
 @pytest.mark.parametrize("name", ["Co-60", "Cs-137", "I-131"])
-@pytest.mark.parametrize(("flight", "tolerance"), [(cone, 0.008), (lambda at: FLIGHT, 0.03)], ids=["angle", "survey"])
+@pytest.mark.parametrize(("flight", "tolerance"), [(cone, 0.02), (lambda at: FLIGHT, 0.06)], ids=["angle", "survey"])
 def test_the_score_of_a_weak_source_is_the_likelihood_ratio_and_a_squared_information(name, flight, tolerance):
     """s^2 / I = A^2 I where s = A I; noiseless counts of a source far below the background.
 
-    The scan knows the rates at one angle to the crystal's axis, which is what the larger tolerance of a survey is for.
+    The scan knows the rates at one angle to the crystal's axis, which is what the larger tolerance of a survey is for,
+    and what the ground scatters at four distances, linear between them.
     """
     k = NUCLIDES.index(name)
     rng = np.random.default_rng(k)
@@ -114,7 +115,7 @@ def test_the_score_of_a_weak_source_is_the_likelihood_ratio_and_a_squared_inform
         assert int(found.nuclide[0]) == k
         np.testing.assert_allclose(found.activity_bq[0], activity, rtol=tolerance)
         np.testing.assert_allclose(activity**2 * information, ratio, rtol=2.0 * tolerance)
-        np.testing.assert_allclose(found.statistic[0], ratio, rtol=0.01)
+        np.testing.assert_allclose(found.statistic[0], ratio, rtol=0.015)
 
 
 def test_without_a_source_the_score_is_nothing_anywhere():

@@ -1,5 +1,7 @@
 """Detectors for estimates: rates by region and their slopes, and tables of few lines against those of all."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from swarmsim.radiation.coarse import coarse
 from swarmsim.radiation.detector import Source
 from swarmsim.radiation.rate import roi_rates, roi_rates_and_slopes
 from swarmsim.site import Crossed
+from swarmsim.site.rays import Shape, stretched
 
 Detectors = dict[tuple[str, str], Detector]
 MATERIALS = ("air", "concrete", "steel")
@@ -28,11 +31,16 @@ def ways(detector: Detector, seed: int, count: int, walls: float = 0.3) -> tuple
     length[:, detector.material_names.index("concrete")] = rng.uniform(0.0, walls, count)
     between = rng.uniform(0.05, 0.95, length.shape)
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    return Crossed(length_m=f32(length), place=f32(between)), f32(place), f32(axis)
+    shape = Shape(
+        thin_m=f32(length * np.where(rng.random(length.shape) < 0.5, 1.0, rng.uniform(0.3, 1.0, length.shape))),
+        spread=f32(rng.uniform(0.1, 1.0, count)), closed=f32(rng.integers(2, size=count)),
+        ground=f32(np.sort(rng.uniform(0.0, 1.0, (count, 2)))[:, ::-1]),
+    )  # fmt: skip
+    return Crossed(length_m=f32(length), place=f32(between), shape=shape), f32(place), f32(axis)
 
 
-def stretched(way: Crossed, material: int, factor: float) -> Crossed:
-    return Crossed(length_m=way.length_m.at[:, material].mul(factor), place=way.place)
+def thicker(way: Crossed, material: int, factor: float) -> Crossed:
+    return stretched(way, jnp.ones(way.length_m.shape[1]).at[material].set(factor))
 
 
 def source(nuclide: int) -> Source:
@@ -61,12 +69,26 @@ def test_rates_with_slopes_are_the_rates_and_slopes_their_differences(
     rates, slopes = (np.asarray(x, float) for x in found)
     np.testing.assert_allclose(rates, _each(d, jnp.int32(k), way, place, axis), rtol=2e-4, atol=1e-6 * rates.max())
     up, down = (
-        np.stack([_each(d, jnp.int32(k), stretched(way, m, np.exp(s)), place, axis) for m in columns], axis=1)
+        np.stack([_each(d, jnp.int32(k), thicker(way, m, np.exp(s)), place, axis) for m in columns], axis=1)
         for s in (step, -step)
     )
     difference = (up - down) / (2.0 * step)
     # of the largest: that the spectrum softens with depth is left out
     assert np.max(np.abs(slopes - difference)) <= 0.15 * np.max(np.abs(difference))
+
+
+def test_a_way_without_a_shape_has_wide_walls_and_no_ground(detectors: Detectors) -> None:
+    d = detectors["nai_1p5x1p5", "physical"]
+    way, place, axis = ways(d, 5, 6)
+    ones = jnp.ones(6)
+    shape = Shape(thin_m=way.length_m, spread=ones, closed=0.0 * ones, ground=jnp.zeros((6, 2)))
+    columns = tuple(d.material_names.index(name) for name in ("air", "concrete"))
+    found, expected = (
+        _with_slopes(d, source(0), replace(way, shape=each), place, axis, by=columns) for each in (None, shape)
+    )
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5 * float(jnp.max(jnp.abs(other))))
 
 
 def test_few_lines_keep_the_counts_of_every_nuclide_behind_concrete(detectors: Detectors) -> None:
@@ -76,7 +98,9 @@ def test_few_lines_keep_the_counts_of_every_nuclide_behind_concrete(detectors: D
     assert few.yields.shape == (len(full.nuclide_names), LINES)
     columns = jnp.array([full.material_names.index(name) for name in MATERIALS])
     way, place, axis = ways(full, 0, 200)
-    less = Crossed(length_m=way.length_m[:, columns], place=way.place[:, columns])
+    assert way.shape is not None
+    shape = replace(way.shape, thin_m=way.shape.thin_m[:, columns])
+    less = Crossed(length_m=way.length_m[:, columns], place=way.place[:, columns], shape=shape)
     worst = {}
     for k, name in enumerate(full.nuclide_names):
         exact, found = (

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from yards import MATERIALS, make_site
 
-from swarmsim.site import path_lengths
+from swarmsim.site import crossed, path_lengths
 from swarmsim.site.rays import by_threads, crossed_from
 
-lengths_of = jax.jit(path_lengths)
+CONCRETE = MATERIALS.index("concrete")
+lengths_of, crossed_of = jax.jit(path_lengths), jax.jit(crossed)
 gradients = jax.jit(
     jax.grad(lambda site, a, b: path_lengths(site, a, b) @ jnp.arange(1.0, len(MATERIALS) + 1.0), argnums=(1, 2))
 )
@@ -177,4 +178,52 @@ def test_a_thread_for_each_segment_crosses_the_same():
     found = jax.jit(jax.vmap(lambda a: by_threads(site, a, ends, "gpu, interpreted")))(starts)
     np.testing.assert_allclose(found.length_m, expected.length_m, atol=1e-4)
     np.testing.assert_allclose(found.place, expected.place, atol=1e-4)
+    one_by_one = jax.jit(jax.vmap(lambda a: jax.vmap(lambda b: crossed(site, a, b))(ends)))(starts)
+    for name in ("thin_m", "spread", "closed", "ground"):
+        for other in (found, one_by_one):
+            np.testing.assert_allclose(getattr(other.shape, name), getattr(expected.shape, name), atol=2e-4)
     assert float(expected.length_m.max()) > 5.0
+    assert 0.0 <= float(expected.shape.spread.min()) < 0.5
+
+
+def shape_of(site, a, b):
+    way = crossed_of(site, jnp.array(a, jnp.float32), jnp.array(b, jnp.float32))
+    return float(way.length_m[CONCRETE]), float(way.shape.thin_m[CONCRETE]), way.shape
+
+
+def test_the_short_way_through_a_wall_and_what_is_seen_of_it():
+    """A wall 0.2 m thick and 12 m long across the middle of a line of 10 m: h is 2.5 m, times the cosine."""
+    site = make_site([((0.0, 0.0, 0.0), (0.1, 6.0, 200.0), 0.0, 0.0, "concrete")])
+    length, thin, shape = shape_of(site, (-5, 0, 0), (5, 0, 0))
+    assert (length, thin) == (pytest.approx(0.2, rel=1e-4), pytest.approx(0.2, rel=1e-4))
+    assert float(shape.spread) == pytest.approx(6.0 / np.hypot(6.0, 2.5), rel=2e-3)
+    assert float(shape.closed) == 0.0
+    length, thin, shape = shape_of(site, (-3, 4, 0), (3, -4, 0))  # at 53 degrees
+    assert (length, thin) == (pytest.approx(1 / 3, rel=1e-4), pytest.approx(0.2, rel=1e-3))
+    edges = [x / np.hypot(x, 1.5) for x in (5.87, 6.13)]
+    assert float(shape.spread) == pytest.approx(np.mean(edges), rel=2e-3)
+    assert float(shape_of(site, (-5, 5.9, 0), (5, 5.9, 0))[2].spread) == pytest.approx(0.5 * (0.04 + 0.979), rel=0.01)
+
+
+def test_a_line_out_of_a_building_knows_that_it_is_closed():
+    site = make_site([((0.0, 0.0, 5.0), (4.0, 3.0, 5.0), 0.0, 0.2, "concrete")])
+    inside, outside, behind = (1.0, 0.0, 5.0), (20.0, 12.0, 5.0), (-20.0, 0.0, 5.0)
+    for a, b in ((inside, outside), (outside, inside)):
+        length, thin, shape = shape_of(site, a, b)
+        assert length > 0.2
+        assert thin == pytest.approx(0.2, rel=1e-3)
+        assert float(shape.closed) == pytest.approx(1.0, rel=1e-4)
+    _, thin, shape = shape_of(site, behind, (20.0, 2.0, 5.0))
+    assert thin == pytest.approx(0.4, rel=1e-3)
+    assert float(shape.closed) == 0.0
+    _, _, shape = shape_of(site, (0.0, 20.0, 5.0), (20.0, 20.0, 5.0))
+    assert (float(shape.spread), float(shape.closed)) == (1.0, 0.0)
+
+
+def test_the_mirror_image_of_the_ground():
+    site = make_site(terrain=np.full((7, 7), 2.0))
+    found = crossed_of(site, jnp.array([0.0, 0.0, 3.0]), jnp.array([4.0, 0.0, 6.0])).shape.ground
+    ratio, u = 25.0 / 41.0, 5.0 / np.sqrt(41.0)
+    np.testing.assert_allclose(found, [ratio * np.sqrt(u), ratio * u], rtol=1e-5)
+    below = crossed_of(site, jnp.array([0.0, 0.0, 1.0]), jnp.array([4.0, 0.0, 1.5])).shape.ground
+    np.testing.assert_allclose(below, 0.0, atol=1e-6)
