@@ -36,7 +36,6 @@ MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count f
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
 LOOSE = 1e-4  # precision of what has no prior
-TAIL = 4.0  # degrees of freedom of a window's gain: a fence between two rays takes a third of the counts
 
 
 @pytree
@@ -141,13 +140,14 @@ def _variance(
     return jnp.clip(jnp.stack([background, variance], axis=-1), 1e-6, 1.0)
 
 
-def _own_precision(variance: jax.Array, u: Unknowns) -> jax.Array:
+def _own_precision(problem: Problem, variance: jax.Array, u: Unknowns) -> jax.Array:
     """Precisions [n, 2] of the priors of a window's own unknowns at ``u``, from their variances.
 
     The gain has Student's t-distribution: its precision is that of the normal distribution with the same slope at ``u``
     (iteratively reweighted least squares: Lange, Little and Taylor, JASA 84, 1989, 881).
     """
-    heavy = (TAIL + 1.0) / (TAIL * variance[:, 1] + jnp.square(u.gain))
+    tail = problem.tail
+    heavy = (tail + 1.0) / (tail * variance[:, 1] + jnp.square(u.gain))
     return jnp.stack([1.0 / variance[:, 0], heavy], axis=-1)
 
 
@@ -185,7 +185,7 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
     weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
     left = weight * (m.rois - model.mean)
     common_precision = prior_precision(problem, u.others.shape[0])
-    own_precision = _own_precision(model.variance, u)
+    own_precision = _own_precision(problem, model.variance, u)
     nuisance = window_unknowns(u)
     columns = jnp.concatenate([model.common, model.moved], axis=-1)
     # products of a few numbers for each window are written as sums: a batched matrix product would be slower
@@ -251,7 +251,7 @@ def log_prior(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
     """Log prior [] of the unknowns but the place, up to a constant."""
     shared = prior_precision(problem, u.others.shape[0]) * jnp.square(_common(u))
     relative = jnp.square(window_unknowns(u)) / model.variance
-    own = relative[:, 0] + (TAIL + 1.0) * jnp.log1p(relative[:, 1] / TAIL)
+    own = relative[:, 0] + (problem.tail + 1.0) * jnp.log1p(relative[:, 1] / problem.tail)
     return -0.5 * (jnp.sum(shared) + jnp.sum(jnp.where(problem.measurements.valid, own, 0.0)))
 
 

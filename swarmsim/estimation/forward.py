@@ -48,6 +48,7 @@ class Problem:
     material_std: jax.Array  # [U] prior of ln(true over presumed length) in each uncertain material
     background_std: jax.Array  # [] of a window's ln(background over the detector's level)
     model_std: jax.Array  # [] of a window's ln(true over modelled rate of the sources)
+    tail: jax.Array  # [] degrees of freedom of the distribution (Student's t) of a window's rate
     pose_std_m: jax.Array  # [n] of a window's place
     log_activity: jax.Array  # [] prior of ln(activity in Bq), its mean
     log_activity_std: jax.Array  # []

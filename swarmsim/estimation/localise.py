@@ -24,6 +24,7 @@ from swarmsim.radiation.detector import AIR, Detector
 from swarmsim.site import Site, sample
 from swarmsim.site.model import height_at
 
+TAIL = 4.0  # degrees of freedom of the error of a window's rate: a post between two rays takes a third of the counts
 LINES = 8  # of a nuclide, to which neighbours are put together
 WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
 BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known: half of it may be missing
@@ -225,6 +226,7 @@ def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span
         material_std=jnp.asarray(presumed.material_std),
         background_std=jnp.asarray(presumed.background_std),
         model_std=jnp.asarray(presumed.model_std),
+        tail=jnp.asarray(TAIL),
         learning_rate=jnp.asarray(presumed.learning_rate),
         log_activity=jnp.asarray(presumed.log_activity),
         log_activity_std=jnp.asarray(presumed.log_activity_std),

@@ -39,6 +39,7 @@ LEAST_EFFECTIVE = 16.0  # weights are flattened until they count as this many wh
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
 LEAST_ROUNDS = 4
 LEAST_STD_M = 1e-3
+NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 1  # Gauss-Newton steps at a place
 
 
@@ -285,6 +286,8 @@ def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_ro
 
 def goodness(problem: Problem, state: State) -> Goodness:
     """How well the sources of ``state`` describe the counts."""
+    # outliers that the fit may take for errors of the model are to be seen here
+    problem = replace(problem, tail=jnp.asarray(NO_TAIL))
     m = problem.measurements
     assert m.rois is not None
     u, model = alone(problem, state.added, state.unknowns, ALONE_STEPS)

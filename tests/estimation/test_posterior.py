@@ -142,7 +142,7 @@ def test_moments_are_those_of_the_integral(boxes, rate, reach, near, seed):
     assert np.all(np.abs(np.asarray(found.mean)[:2] - mean[:2]) < near * std[:2])
     assert abs(float(found.mean[3]) - mean[3]) < near * float(sampled[3])
     # beside walls the weights are flattened until they are worth enough places: wider, never narrower
-    assert np.all(sampled[:2] > 0.8 * std[:2])
+    assert np.all(sampled[:2] > 0.75 * std[:2])
     assert np.all(sampled[:2] < (1.4 if boxes else 1.2) * std[:2])
     np.testing.assert_allclose(sampled[3], std[3], rtol=0.15)
     assert float(found.effective) > 16.0
