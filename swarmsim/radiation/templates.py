@@ -3,6 +3,8 @@
 A gain g records the pulses of channel e in channel g e. The resolution changes as by heat conduction: a peak of
 variance v(E) is the pulse heights after diffusion, and dS/dv is half the second derivative, so that a relative width
 rho adds t A S + t^2 A^2 S / 2 with A S = d2(v S)/dE2 and t = (rho^2 - 1) / 2. This narrows as well as it broadens.
+Spectra of lines and of scattered photons are tabulated by bins at some gains with these changes when a detector is
+built (host side); what is left for the device is to add them up behind each shield.
 """
 
 from typing import NamedTuple
@@ -10,71 +12,92 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from swarmsim.radiation.cylinder import direction_basis
 from swarmsim.radiation.detector import AIR, Detector
+from swarmsim.radiation.lines import SHIELDS
 from swarmsim.radiation.rate import scattered_shares, transmission
 from swarmsim.site.rays import Crossed
 
-SHIELDS = ("concrete", "steel", "lead")
-DEPTHS = (0.3, 1.3, 4.0)
-"""Optical depths of the shields of the templates; sums of them and of the bare spectrum cover 0 to 4. The least stops
-the X-rays and little else."""
-AIR_M = (30.0, 100.0)
-"""Lengths of the ways in air of the templates; the longest is also that of templates behind the deepest shields."""
-TILT = 0.2
-"""Relative change of the background's shape at both ends of the energies in its two templates."""
-NATURAL = 2
-"""Templates of the background."""
-_TILT_KEV = (30.0, 3000.0)
-_SEARCH_STEPS = 40
+DEPTHS = (0.4, 1.1, 1.9, 2.9, 4.1)
+"""Optical depths of the shields of the templates. The least stops the X-rays and little else."""
+AIR_M = (60.0,)
+"""Lengths of the ways in air of the templates."""
+_BARE_SHARE, _AIR_SHARE = 0.3, 0.1  # of the prior of the shields; all walls and depths share the rest
+_SEARCH_STEPS = 30
 
 
-class Templates(NamedTuple):
-    """Templates by channel; each sums to 1 above the threshold."""
+class Tables(NamedTuple):
+    """Spectra in the bins of identification, by order of `swarmsim.radiation.lines.orders`: gain, and width."""
 
-    background: jax.Array  # [2, channels] tilted down and up
-    nuclides: jax.Array  # [N, shields, channels] bare first
-    lines: jax.Array  # [grid, channels] free lines
+    background: jax.Array  # [gains, 2, orders, bins] as it is, sums to 1, and times `tilt`
+    sources: jax.Array  # [N shields, gains, orders, bins] sum to 1
+    scattered: jax.Array  # [N shields, gains, orders, bins] the part of scattered photons
+    lines: jax.Array  # [shields, grid, bins]
 
 
-def templates(detector: Detector) -> Templates:
-    """Templates of every nuclide of a detector with energy resolution."""
+def shields(detector: Detector) -> list[tuple[int, float, float]]:
+    """Material, optical depth and length of air of every shield of the templates, bare first."""
     names = detector.material_names
     walls = [names.index(name) for name in SHIELDS if name in names] or [0]
-    layers = [(wall, depth, 0.0) for wall in walls for depth in DEPTHS]
-    if AIR in names:
-        layers += [(walls[0], 0.0, length) for length in AIR_M]
-        layers += [(wall, DEPTHS[-1], AIR_M[-1]) for wall in walls]
+    air = [(walls[0], 0.0, length) for length in AIR_M if AIR in names]
+    return [(walls[0], 0.0, 0.0), *air, *((wall, depth, 0.0) for wall in walls for depth in DEPTHS)]
+
+
+def shield_shares(detector: Detector) -> NDArray[np.float64]:
+    """Prior [shields] of each shield."""
+    layers = shields(detector)
+    wall, air = np.array([depth > 0.0 for _, depth, _ in layers]), np.array([length > 0.0 for _, _, length in layers])
+    share = np.where(wall, (1.0 - _BARE_SHARE - _AIR_SHARE) / wall.sum(), _AIR_SHARE / max(air.sum(), 1))
+    share[0] = _BARE_SHARE
+    return np.asarray(share / share.sum())
+
+
+def tables(detector: Detector) -> Tables:
+    """Spectra of every nuclide of a detector with energy resolution behind every shield."""
+    names, n = detector.material_names, len(detector.nuclide_names)
     is_air = jnp.array([name == AIR for name in names])
 
-    def of_nuclide(number: jax.Array) -> jax.Array:
-        def behind(layer: jax.Array) -> jax.Array:
-            wall = layer[0].astype(jnp.int32)
-            thickness = thickness_m(detector, number, wall, layer[1])
-            return shielded(detector, number, thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air)
+    def behind(number: jax.Array, layer: jax.Array) -> tuple[jax.Array, jax.Array]:
+        wall = layer[0].astype(jnp.int32)
+        thickness = thickness_m(detector, number, wall, layer[1])
+        return _counts(detector, number, thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air, 0.5)
 
-        return jax.lax.map(behind, jnp.asarray([(walls[0], 0.0, 0.0), *layers], jnp.float32))
+    layers = jnp.asarray(shields(detector), jnp.float32)
+    direct, bins = jax.vmap(lambda k: jax.vmap(lambda layer: behind(k, layer))(layers))(jnp.arange(n))
+    total = jnp.maximum(jnp.sum(direct, axis=-1) + jnp.sum(bins, axis=-1), 1e-30)[..., None]
+    direct, bins = direct / total, bins / total
+    size = detector.peak_orders.shape[2:]
+    peaks = detector.peak_orders.reshape(*direct.shape[::2], -1)
+    scattered = bins.reshape(n * len(layers), -1) @ detector.bin_orders.reshape(bins.shape[-1], -1)
+    unscattered = jnp.einsum("nsl,nlx->nsx", direct, peaks).reshape(scattered.shape)
 
-    slope = TILT * tilt(detector.energy_kev)
-    background = detector.background_spectrum * jnp.stack([1.0 - slope, 1.0 + slope])
-    nuclides = jax.lax.map(of_nuclide, jnp.arange(len(detector.nuclide_names)))
-    return Templates(*map(_normalised, (background, nuclides, detector.grid_spectrum)))
+    return Tables(
+        background=detector.natural_orders,
+        sources=(unscattered + scattered).reshape(-1, *size),
+        scattered=scattered.reshape(-1, *size),
+        lines=detector.grid_spectrum,
+    )
 
 
-def tilt(energy_kev: jax.Array) -> jax.Array:
-    """A slope over energies [...]: linear in their logarithm, -1 at 30 keV, 1 at 3 MeV."""
-    low, high = np.log(_TILT_KEV)
-    return jnp.clip((2.0 * jnp.log(energy_kev) - low - high) / (high - low), -1.0, 1.0)
+def _counts(
+    detector: Detector, nuclide: jax.Array, length_m: jax.Array, place: jax.Array | float
+) -> tuple[jax.Array, jax.Array]:
+    """Counts of unscattered photons by line [L] and of scattered ones by bin, of a nuclide end on, up to one factor.
 
-
-def shielded(detector: Detector, nuclide: jax.Array, length_m: jax.Array) -> jax.Array:
-    """Spectrum [channels] of a nuclide end on behind ``length_m`` [M] of each material half way, up to a factor."""
-    way = Crossed(length_m=length_m, place=jnp.full(len(detector.material_names), 0.5))
+    The way crosses ``length_m`` [M] of each material, whose middle is at ``place`` [] between source (0) and detector.
+    """
+    way = Crossed(length_m=length_m, place=jnp.full(len(detector.material_names), place))
     lines = _bare_lines(detector, nuclide)
     direct, scattered = transmission(detector, nuclide, way)
-    bins = (lines * scattered) @ scattered_shares(detector, nuclide, way)
-    return (lines * direct) @ detector.peak_spectrum[nuclide] + bins @ detector.bin_spectrum
+    return lines * direct, (lines * scattered) @ scattered_shares(detector, nuclide, way)
+
+
+def shielded(detector: Detector, nuclide: jax.Array, length_m: jax.Array, place: jax.Array | float = 0.5) -> jax.Array:
+    """Spectrum [channels] of a nuclide end on behind ``length_m`` [M] of each material at ``place``, up to a factor."""
+    direct, bins = _counts(detector, nuclide, length_m, place)
+    return direct @ detector.peak_spectrum[nuclide] + bins @ detector.bin_spectrum
 
 
 def thickness_m(detector: Detector, nuclide: jax.Array, material: jax.Array, depth: jax.Array) -> jax.Array:
@@ -98,37 +121,3 @@ def _bare_lines(detector: Detector, nuclide: jax.Array) -> jax.Array:
     """Counts [L] of each line without attenuation, end on, up to a factor."""
     end_on = direction_basis(jnp.float32(1.0), jnp.float32(0.0))
     return detector.yields[nuclide] * (detector.effective_area_m2[nuclide] @ end_on)
-
-
-def _normalised(spectra: jax.Array) -> jax.Array:
-    return spectra / jnp.maximum(jnp.sum(spectra, axis=-1, keepdims=True), 1e-30)
-
-
-def widened(detector: Detector, spectra: jax.Array, width: jax.Array) -> jax.Array:
-    """Spectra [..., channels] with the resolution's width times ``width`` []."""
-    first = detector.identification_bins[0]
-    variance = (detector.sigma_kev / (detector.energy_kev[1] - detector.energy_kev[0])) ** 2
-
-    def conduct(values: jax.Array) -> jax.Array:
-        flow = jnp.diff((variance * values)[..., first:], axis=-1)
-        # nothing flows over the threshold or the end
-        change = jnp.diff(jnp.pad(flow, [(0, 0)] * (flow.ndim - 1) + [(1, 1)]), axis=-1)
-        return jnp.pad(change, [(0, 0)] * (flow.ndim - 1) + [(first, 0)])
-
-    time = 0.5 * (width**2 - 1.0)
-    once = conduct(spectra)
-    return jnp.maximum(spectra + time * once + 0.5 * time**2 * conduct(once), 0.0)
-
-
-def rebinned(detector: Detector, spectra: jax.Array, gain: jax.Array, edges: np.ndarray) -> jax.Array:
-    """Counts [..., bins] of spectra [..., channels] between ``edges`` [bins + 1] (channels) at a gain [].
-
-    Below the threshold, where the tables hold nothing, they go on as in the first channel above it.
-    """
-    first = detector.identification_bins[0]
-    filled = jnp.where(jnp.arange(spectra.shape[-1]) < first, spectra[..., first : first + 1], spectra)
-    below = jnp.pad(jnp.cumsum(filled, axis=-1), [(0, 0)] * (spectra.ndim - 1) + [(1, 0)])
-    place = jnp.clip(edges / gain, 0.0, spectra.shape[-1])
-    left = jnp.minimum(place.astype(jnp.int32), spectra.shape[-1] - 1)
-    at_edges = below[..., left] + (place - left) * filled[..., left]
-    return jnp.diff(at_edges, axis=-1)
