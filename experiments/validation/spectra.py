@@ -59,8 +59,8 @@ class Instrument:
     ) -> Cases:
         """Poisson spectra of ``nuclide`` [n] with ``net`` [n] counts on a background of twice the rate.
 
-        Each is behind up to `AIR_M` of air and one of `WALLS` anywhere on the way, of 0 to ``depth_max`` mean free paths;
-        ``drift`` scales the ranges of gain, resolution, and amplitude and tilt of the background.
+        Each is behind up to `AIR_M` of air and one of `WALLS` anywhere on the way, of 0 to ``depth_max`` mean free
+        paths; ``drift`` scales the ranges of gain, resolution, and amplitude and tilt of the background.
         """
         n = len(nuclide)
         version = rng.integers(len(WIDTHS), size=n) if drift > 0.0 else np.full(n, WIDTHS.index(1.0))

@@ -20,9 +20,10 @@ from swarmsim.config.errors import InputError
 from swarmsim.pytree import pytree
 from swarmsim.radiation.detector import Detector
 from swarmsim.radiation.goodness import p_value
-from swarmsim.radiation.laplace import COLUMNS, GAIN_STD, NATURAL, SOURCES, Data, Fit, binned_data, laplace
+from swarmsim.radiation.laplace import COLUMNS, GAIN_STD, NATURAL, PARTS, SOURCES, Data, Fit, binned_data, laplace
 from swarmsim.radiation.lines import GAINS
 from swarmsim.radiation.pursuit import (
+    Found,
     Sources,
     bin_weights,
     natural_slopes,
@@ -91,7 +92,10 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
     n = len(detector.nuclide_names)
     table, data = tables(detector), binned_data(detector, counts, live_s)
     stages = _stages(table, data, jnp.asarray(np.log(shield_shares(detector)), jnp.float32), n)
-    prior = _PRIOR_ONE / n, *(p / max(math.comb(n, k), 1) for p, k in ((_PRIOR_TWO, 2),) * 2 + ((_PRIOR_THREE, 3),))
+    prior = (
+        _PRIOR_ONE / n,
+        *(p / max(math.comb(n, k), 1) for p, k in ((0.5 * _PRIOR_TWO, 2),) * 2 + ((_PRIOR_THREE, 3),)),
+    )
     log_prior = np.log([p if n > k else 1e-30 for p, k in zip(prior, _BASE_SIZE, strict=True)])
     score = stages.score + log_prior[:, None]  # [stages, N]
     none, unknown = stages.base_fit.score[0] + math.log(_PRIOR_NONE), stages.strangers[0] + math.log(_PRIOR_UNKNOWN)
@@ -127,61 +131,56 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
 
 
 def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stage:
-    """All stages: one nuclide; another with the best; another with the second best; a third with the best two."""
+    """All stages: one nuclide; another with the best; another with that one alone; a third with the best two."""
     shields = table.sources.shape[0] // n
     weight, slopes = bin_weights(table, data), natural_slopes(table, data)
     row_prior = jnp.tile(shield_prior, n)
-    # without sources: linear in amplitude and tilt about each gain
-    expected_0 = data.natural * table.background[:, 0, 0]
-    slopes_0 = jnp.zeros((len(GAINS), COLUMNS + 2, data.counts.shape[0])).at[:, :NATURAL].set(slopes[:, :NATURAL])
-    gains = jnp.asarray(GAINS)
-    gains_0 = -0.5 * ((gains - 1.0) / GAIN_STD) ** 2
-    other = strangers(table, data, weight, slopes, screen(table, data, weight, expected_0, slopes_0, gains_0).base_gain)
+    gains = jnp.arange(len(GAINS))
+    gain_prior = -0.5 * ((jnp.asarray(GAINS) - 1.0) / GAIN_STD) ** 2
+    nobody = Sources(jnp.zeros(SOURCES, jnp.int32), jnp.zeros(SOURCES), jnp.zeros(SOURCES))
+
+    def added_to(own: Sources, counts: jax.Array) -> Found:
+        """Candidates at all gains, whose amplitudes follow; ``counts`` [COLUMNS] are those of the base."""
+        about = jax.vmap(lambda gain: of_library(table, data, own, gain))(gains)
+        shape = about.column[:, :, 0]  # [gains, COLUMNS, bins]
+        slope = about.scale[..., None] * shape
+        return screen(table, data, weight, jnp.einsum("c,gcb->gb", counts, shape), slope, gain_prior)
+
+    alone = jnp.zeros(COLUMNS).at[0].set(data.natural)
+    other = strangers(table, data, weight, slopes, added_to(nobody, alone).base_gain)
 
     def stage(bases: _Base, k: jax.Array) -> tuple[_Base, _Stage]:
         base = jax.tree.map(lambda leaf: leaf[k], bases)
         size = jnp.asarray(_BASE_SIZE)[k]
-        nearest = jnp.argmin(jnp.abs(gains - base.fit.gain))
-        found = screen(
-            table,
-            data,
-            weight,
-            jnp.where(k == 0, expected_0, base.fit.expected),
-            jnp.where(k == 0, slopes_0, base.fit.slope),
-            jnp.where(k == 0, gains_0, jnp.where(jnp.arange(len(GAINS)) == nearest, 0.0, -jnp.inf)),
-        )
+        own = Sources(base.sources.row, base.sources.present, jnp.sum(strengths(base.fit), axis=1))
+        found = added_to(own, base.fit.counts)
         in_base = jnp.zeros(n).at[base.sources.row // shields].max(base.sources.present)
-        first = jnp.zeros(n).at[bases.sources.row[1, 0] // shields].set(1.0) * (k == 2)  # stage 1 has that pair
-        again = in_base + first > 0.0
+        again = in_base > 0.0
         ranked = found.score + row_prior + jnp.where(jnp.repeat(again, shields), -1e6, 0.0)
         by_nuclide, which = jax.lax.top_k(ranked.reshape(n, shields), _SHIELDS_EACH)
         few = jax.lax.top_k(by_nuclide.ravel(), min(CANDIDATES, n * _SHIELDS_EACH))[1]
         row = few // _SHIELDS_EACH * shields + which.ravel()[few]
-        own = Sources(base.sources.row, base.sources.present, jnp.sum(strengths(base.fit), axis=1))
+        # the first two at the neighbouring gains too: to second order the base may point to a wrong one
+        at = jnp.concatenate([found.gain[row], (found.gain[row[:2]][:, None] + jnp.array([-1, 1])).ravel()])
+        row = jnp.concatenate([row, jnp.repeat(row[:2], 2)])
         candidates = jax.vmap(lambda r: with_new(own, size, r, found.strength[r]))(row)
-        at = jnp.where(k == 0, found.gain[row], nearest)
-        base_gain = jnp.where(k == 0, found.base_gain, nearest)
         hypotheses = [
-            jax.vmap(lambda s, g: of_library(table, data, s, g))(candidates, at),
-            jax.tree.map(lambda leaf: leaf[None], of_library(table, data, own, base_gain)),
+            jax.vmap(lambda s, g: of_library(table, data, s, g))(candidates, jnp.clip(at, 0, len(GAINS) - 1)),
+            jax.tree.map(lambda leaf: leaf[None], of_library(table, data, own, found.base_gain)),
             other.hypotheses,
         ]
         fits = jax.vmap(lambda h: laplace(h, data))(jax.tree.map(lambda *a: jnp.concatenate(a), *hypotheses))
-        many = row.shape[0]
+        many, first_many = row.shape[0], few.shape[0]
         fitted = fits.score[:many] + row_prior[row]
         # what is not fitted is off by as much as what is
-        shift = logsumexp(fitted) - logsumexp(ranked[row])
-        scores = (ranked + shift).at[row].set(fitted + jnp.where(again[row // shields], -1e6, 0.0))
+        shift = logsumexp(fitted[:first_many]) - logsumexp(ranked[row[:first_many]])
+        scores = (ranked + shift).at[row].set(-jnp.inf)
+        scores = scores.at[row].max(fitted + jnp.where(again[row // shields], -1e6, 0.0))
         evidence = logsumexp(scores.reshape(n, shields), axis=1)
         best = jnp.argmax(fitted)
-        second = jnp.argmax(jnp.where(row // shields == row[best] // shields, -jnp.inf, fitted))
 
-        def chosen(number: jax.Array) -> _Base:
-            fit = jax.tree.map(lambda leaf: leaf[number], fits)
-            more = evidence[row[number] // shields] - fit.score
-            return _Base(jax.tree.map(lambda leaf: leaf[number], candidates), fit, base.log_prior + more)
-
-        winner, runner = chosen(best), chosen(second)
+        sources, fit = jax.tree.map(lambda leaf: leaf[best], (candidates, jax.tree.map(lambda leaf: leaf[:many], fits)))
+        winner = _Base(sources, fit, base.log_prior + evidence[row[best] // shields] - fit.score)
         counts = jnp.sum(strengths(winner.fit), axis=1) * winner.sources.present
         counts /= jnp.maximum(jnp.sum(counts), 1e-9)
         new = counts[size]
@@ -197,16 +196,24 @@ def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stag
             strangers=other.total + extra,
         )
         better = (k == 1) | (winner.fit.score + winner.log_prior > bases.fit.score[3] + bases.log_prior[3])
-        places = jnp.where(k == 0, jnp.array([1, 2]), jnp.where((k < 3) & better, jnp.array([3, 3]), jnp.array([4, 4])))
-        for place, new_base in ((places[0], winner), (places[1], jax.tree.map(
-            lambda a, b: jnp.where(k == 0, a, b), runner, winner))):  # fmt: skip
+        # the nuclide that was added to the first one, alone: so that the first one's shield is found again beside it
+        parts = strengths(winner.fit)[size]
+        lone = _Base(
+            Sources(*(jnp.zeros_like(leaf).at[0].set(leaf[size]) for leaf in winner.sources)),
+            winner.fit._replace(counts=jnp.zeros(COLUMNS).at[:NATURAL].set(winner.fit.counts[:NATURAL])),
+            winner.log_prior - base.log_prior,
+        )
+        lone = lone._replace(fit=lone.fit._replace(counts=lone.fit.counts.at[NATURAL : NATURAL + PARTS].set(parts)))
+        for place, new_base in (
+            (jnp.where(k == 0, 1, jnp.where((k < 3) & better, 3, 4)), winner),
+            (jnp.where(k == 1, 2, 4), lone),
+        ):
             bases = jax.tree.map(lambda all_of, one, p=place: all_of.at[p].set(one), bases, new_base)
         return bases, out
 
     bins = data.counts.shape[0]
     zero = jnp.zeros(())
-    fit = Fit(zero, jnp.zeros(COLUMNS), zero + 1.0, zero, jnp.zeros(bins), jnp.zeros((COLUMNS + 2, bins)))
-    empty = _Base(Sources(jnp.zeros(SOURCES, jnp.int32), jnp.zeros(SOURCES), jnp.zeros(SOURCES)), fit, zero)
+    empty = _Base(nobody, Fit(zero, alone, zero + 1.0, zero, jnp.zeros(bins)), zero)
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (5, *leaf.shape)), empty)
     return jax.lax.scan(stage, start, jnp.arange(len(_BASE_SIZE)))[1]
 

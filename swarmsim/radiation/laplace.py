@@ -26,6 +26,7 @@ GAIN_RANGE, WIDTH_RANGE = (0.965, 1.035), (-0.14, 0.16)
 NATURAL_STD, TILT_STD = 0.4, 0.1  # of the prior of the background's amplitude and tilt, relative
 PART_STD = 0.5  # of the prior of scattered photons, relative to the source
 _GAIN_REACH = 0.009  # from the gain of the tables about which columns are expanded
+_LEAST_PART = -0.9  # fewest scattered photons, relative to those of the templates: less than all of them
 _ITERATIONS = 6
 _LOOSE = 0.01  # precision that stands for the prior of a strength while it is fitted
 _TEMPLATE_ERROR = 0.04  # relative error of the templates in a bin: an estimate
@@ -60,7 +61,6 @@ class Fit(NamedTuple):
     gain: jax.Array  # []
     time: jax.Array  # [] (width^2 - 1) / 2
     expected: jax.Array  # [bins]
-    slope: jax.Array  # [COLUMNS + 2, bins] by parameters in units of their prior: columns, gain, width
 
 
 def binned_data(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Data:
@@ -94,7 +94,9 @@ def laplace(hypothesis: Hypothesis, data: Data) -> Fit:
     mean = jnp.zeros(COLUMNS).at[0].set(data.natural)
     precision = jnp.concatenate([jnp.where(strength > 0.0, _LOOSE, 1.0), jnp.ones(2)])
     present = (scale > 0.0).astype(jnp.float32)
-    low = jnp.where(strength > 0.0, 0.0, -jnp.inf).at[0].set(-0.9 / NATURAL_STD)
+    # strengths and the scattered photons among them are not negative
+    low = jnp.where(strength > 0.0, 0.0, _LEAST_PART / PART_STD)
+    low = low.at[:NATURAL].set(jnp.array([-0.9 / NATURAL_STD, -jnp.inf]))
 
     def values(x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Counts [COLUMNS], offset of the gain [] and width []."""
@@ -139,7 +141,7 @@ def laplace(hypothesis: Hypothesis, data: Data) -> Fit:
     score -= 0.5 * jnp.sum(x[-2:] ** 2) + 0.5 * log_volume
     # the matrix has the loose precision where a column is absent
     score += 0.5 * jnp.sum((1.0 - present) * jnp.log(precision[:COLUMNS]))
-    return Fit(score, counts, offset + middle, time, expected, slope)
+    return Fit(score, counts, offset + middle, time, expected)
 
 
 def swept(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -35,7 +35,7 @@ LINES = SOURCES * PARTS
 STRANGERS = 2  # sources that the library lacks, which are fitted in full
 _SMOOTH = np.exp(-0.5 * (np.arange(-5, 6) / 2.0) ** 2)  # weights of neighbouring bins, narrower than a peak
 _DISTINCT = 0.01  # part of its information that a source keeps where it is not one of those before
-_LOG_MORE = float(np.log(0.8))  # logarithm of the prior of one line more
+_MORE = 0.8  # of the sources that the library lacks have one line more than those found: five on average
 _LOOSE = 0.01  # precision of lines that are found, in units of the scale of strengths
 _NATURAL_SHARE = 0.2  # of the nominal background in the expectation for which bins are weighed
 
@@ -116,10 +116,10 @@ def _added(
     slope: jax.Array,
     precision: jax.Array,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """By how much each of ``shape`` [k, bins] raises the logarithm of the evidence [k], its strength [k] in counts,
-    and the logarithm of the evidence [] without them, to second order.
+    """By how much each of ``shape`` [k, bins] raises the logarithm of the evidence [k], and its strength [k] in counts.
 
-    A hypothesis expects ``expected`` [bins], with slopes ``slope`` [V, bins] by parameters of ``precision`` [V] a priori.
+    To second order, with the logarithm of the evidence [] without them. The hypothesis to which they are added expects
+    ``expected`` [bins], with slopes ``slope`` [V, bins] by parameters of ``precision`` [V] a priori.
     """
     left = weight * (data.counts - expected)
     weighted = slope * weight
@@ -174,8 +174,8 @@ def strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax.Array, g
     """The lines that explain the spectrum best, behind every shield; the background is linear about a gain [] int32.
 
     Lines are added one by one where they raise the evidence (orthogonal matching pursuit: Pati, Rezaiifar and
-    Krishnaprasad, Asilomar 1993). The prior of the number of lines n is 2^-n, that of a line's energy is even over
-    the grid, and of its strength as that of a nuclide.
+    Krishnaprasad, Asilomar 1993). Each line is followed by one more in `_MORE` of the cases a priori; its energy
+    is anywhere on the grid, and its strength has the prior of a nuclide's.
     """
     shields, grid, bins = tables.lines.shape
     natural = slope[gain]
@@ -184,11 +184,13 @@ def strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax.Array, g
     precision = jnp.concatenate([jnp.ones(parameters), jnp.full(LINES, _LOOSE)])
 
     def pursue(lines: jax.Array) -> tuple[jax.Array, ...]:
-        def add(carry: tuple[jax.Array, jax.Array], k: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+        def add(
+            carry: tuple[jax.Array, jax.Array], k: jax.Array
+        ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, ...]]:
             found, active = carry
             value, strength, _ = _added(lines, data, weight, expected, jnp.concatenate([natural, found]), precision)
-            gained = logsumexp(jnp.where(strength > 0.0, value, -1e3)) - np.log(grid) + _LOG_MORE
-            active = active & (gained > 0.0)
+            gained = logsumexp(value) - np.log(grid) + jnp.where(k == 0, 0.0, np.log(_MORE))
+            active = (k == 0) | (active & (gained > 0.0))
             best = jnp.argmax(value)
             found = found.at[k].set(jnp.where(active, data.scale * lines[best], 0.0))
             out = (best, jnp.where(active, strength[best], 0.0), active, jnp.where(active, gained, 0.0))
@@ -199,9 +201,8 @@ def strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax.Array, g
         return line, strength, active, jnp.sum(gained), jnp.sum(places)
 
     line, strength, active, gained, places = jax.vmap(pursue)(tables.lines)
-    # one line at least
     score = gained + _added(tables.lines[0], data, weight, expected, natural, jnp.ones(parameters))[2]
-    score -= np.log(shields) + 20.0 * ~active[:, 0]
+    score -= np.log(shields)
     shield = jax.lax.top_k(score, STRANGERS)[1]
 
     def hypothesis(shield: jax.Array) -> Hypothesis:
@@ -221,9 +222,7 @@ def strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax.Array, g
 
 def with_new(base: Sources, stage: jax.Array, row: jax.Array, strength: jax.Array) -> Sources:
     """``base`` with the source ``row`` [] at a place ``stage`` []."""
-    return Sources(
-        base.row.at[stage].set(row), base.present.at[stage].set(1.0), base.strength.at[stage].set(strength)
-    )
+    return Sources(base.row.at[stage].set(row), base.present.at[stage].set(1.0), base.strength.at[stage].set(strength))
 
 
 def strengths(fit: Fit) -> jax.Array:
