@@ -1,5 +1,6 @@
 """Spectra of shielded nuclides as a detector whose gain, resolution and background have drifted would count them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -42,12 +43,13 @@ class Cases:
 class Instrument:
     """A detector model with the versions of it that count: the same crystal at other resolutions."""
 
-    def __init__(self, name: str, library: Library) -> None:
+    def __init__(self, name: str, library: Library, walls: Sequence[str] = WALLS) -> None:
         spec = load_named("detectors", name)
         assert isinstance(spec, DetectorSpec)
         assert spec.spectrometer is not None
         self.detector = build_detector(spec, MOUNT, library, "physical")
         self._versions = []
+        self._walls = walls
         for width in WIDTHS:
             percent = spec.spectrometer.resolution_percent_at_662_kev * width
             analyser = spec.spectrometer.model_copy(update={"resolution_percent_at_662_kev": percent})
@@ -59,12 +61,20 @@ class Instrument:
     ) -> Cases:
         """Poisson spectra of ``nuclide`` [n] with ``net`` [n] counts on a background of twice the rate.
 
-        Each is behind up to `AIR_M` of air and one of `WALLS` anywhere on the way, of 0 to ``depth_max`` mean free
+        Each is behind up to `AIR_M` of air and one of the walls anywhere on the way, of 0 to ``depth_max`` mean free
         paths; ``drift`` scales the ranges of gain, resolution, and amplitude and tilt of the background.
         """
+        mean = self.means(rng, nuclide, net, depth_max, drift)
+        live = net / (NET_SHARE * float(self.detector.background_cps))
+        return Cases(rng.poisson(mean).astype(np.float32), live.astype(np.float32), nuclide)
+
+    def means(
+        self, rng: np.random.Generator, nuclide: NDArray[np.int64], net: Floats, depth_max: float, drift: float = 1.0
+    ) -> Floats:
+        """Expected counts [n, channels] of such spectra."""
         n = len(nuclide)
         version = rng.integers(len(WIDTHS), size=n) if drift > 0.0 else np.full(n, WIDTHS.index(1.0))
-        walls = np.array([self.detector.material_names.index(s) for s in WALLS])
+        walls = np.array([self.detector.material_names.index(s) for s in self._walls])
         way = np.stack(
             [
                 walls[rng.integers(len(walls), size=n)],
@@ -87,7 +97,7 @@ class Instrument:
             mean[rows] = net[rows, None] * source + (live * amplitude)[rows, None] * tilted
         moved = np.stack([_moved(row, g) for row, g in zip(mean, gain, strict=True)])
         moved[:, : self.detector.identification_bins[0]] = 0.0
-        return Cases(rng.poisson(moved).astype(np.float32), live.astype(np.float32), nuclide)
+        return moved
 
 
 def _moved(mean: Floats, gain: float) -> Floats:

@@ -1,8 +1,8 @@
 """Bayesian identification of the nuclides in a spectrum (device side).
 
 The hypotheses: background only; one nuclide; two or three nuclides; something that the library does not hold, which is
-a few lines of any energies. A nuclide is behind one of many shields (concrete, steel, lead of some depth, air), with
-more or fewer scattered photons than that would make, and some photons that went past it; lines are behind shields too.
+a few lines of any energies. A nuclide is behind one of many shields (water, concrete, steel, lead of some depth, air),
+with more or fewer scattered photons than that would make; lines are behind shields too.
 The evidence of each hypothesis is the mean of the likelihood over shields, strengths, gain, resolution and background
 (`swarmsim.radiation.laplace`), so that what explains more spectra is not preferred for fitting one of them.
 Posterior = evidence x prior, where each bin's deviance is reduced to account for the error of the templates.
