@@ -1,11 +1,11 @@
 """How often nuclides are identified, named wrongly, and found to be unknown.
 
-    python -m experiments.validation.identification [--detectors NAME …] [--per-nuclide N] [--out FOLDER]
+    python -m experiments.validation.identification [--detectors NAME …] [--walls NAME …] [--per-nuclide N]
 
-Every nuclide of the library, bare and behind 0 to 4 mean free paths of concrete, steel or lead, at a net rate of half
-the background, with the gain (3 %), the resolution (15 %) and the background's amplitude (20 %) and tilt (10 %) drawn
-at random. Writes ``identification.csv`` (one row for each nuclide and condition) and, for each detector,
-``confusion_<detector>.png`` and ``calibration_<detector>.csv``.
+Every nuclide of the library, bare and behind 0 to 4 mean free paths of any wall, anywhere on a way of up to 30 m in
+air, at a net rate of half the background, with the gain (3 %), the resolution (15 %) and the background's amplitude
+(20 %) and tilt (10 %) drawn at random. Writes ``identification.csv`` (one row for each nuclide and condition) and, for
+each detector, ``confusion_<detector>.png`` and ``calibration_<detector>.csv``.
 """
 
 import csv
@@ -20,7 +20,7 @@ import numpy as np
 from cyclopts import App, Parameter
 from numpy.typing import NDArray
 
-from experiments.validation.spectra import Cases, Instrument, without
+from experiments.validation.spectra import WALLS, Cases, Instrument, without
 from swarmsim.radiation import Detector, Identification, identify, load_library
 from swarmsim.radiation.identify import NONE, UNKNOWN
 
@@ -162,6 +162,7 @@ def told(rows: Sequence[dict[str, Any]]) -> None:
 def main(
     *,
     detectors: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = DETECTORS,
+    walls: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = WALLS,
     per_nuclide: int = 40,
     calibration_cases: int = 4000,
     seed: int = 0,
@@ -171,6 +172,7 @@ def main(
 
     Args:
         detectors: Detector models.
+        walls: Materials of the walls, of which each spectrum has one.
         per_nuclide: Spectra of each nuclide in each condition.
         calibration_cases: Spectra of the calibration.
         seed: Of the random numbers.
@@ -180,7 +182,7 @@ def main(
     library, table = load_library(), []
     for name in detectors:
         print(name, flush=True)
-        instrument, rng = Instrument(name, library), np.random.default_rng(seed)
+        instrument, rng = Instrument(name, library, walls), np.random.default_rng(seed)
         rows, (truth, answer, _) = measured(instrument, per_nuclide, rng)
         told(rows)
         table += [{"detector": name} | row for row in rows]

@@ -55,6 +55,7 @@ def coarse(detector: Detector, lines: int, materials: tuple[str, ...]) -> Detect
         attenuation_1_m=f32(averaged("attenuation_1_m", 0)[..., columns]),
         scatter_1_m=f32(averaged("scatter_1_m", 2)[..., columns]),
         peak_spectrum=f32(np.ones((len(energy), most, 1))),
+        peak_orders=f32(np.zeros((len(energy), most, 1, 1, 1))),
         peak_rois=f32(averaged("peak_rois", 0)),
         scattered_bins=f32(np.ones((len(energy), 1, 1, most, 1))),
         scattered_rois=f32(averaged("scattered_rois", 2)[:, :, columns]),

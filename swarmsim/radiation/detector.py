@@ -14,12 +14,23 @@ from swarmsim.config.radiation import DetectorMount
 from swarmsim.pytree import on_device, pytree, static
 from swarmsim.radiation import scattering
 from swarmsim.radiation.attenuation import linear_attenuation
-from swarmsim.radiation.crystal import ENERGIES_KEV
 from swarmsim.radiation.cylinder import NEAR_TABLES, fit_effective_area, near_tables
 from swarmsim.radiation.ground import from_ground
 from swarmsim.radiation.library import Library
+from swarmsim.radiation.lines import (
+    GAINS,
+    ORDERS,
+    SPECTRUM_BINS,
+    SPECTRUM_DEPTHS,
+    energy_shares,
+    identification_bins,
+    in_spectrum_bins,
+    orders,
+    shielded_lines,
+    spectrum_edges,
+    tilt,
+)
 from swarmsim.radiation.response import (
-    SIGMA_PER_FWHM,
     Response,
     background_spectrum,
     build_response,
@@ -32,10 +43,6 @@ Floats = NDArray[np.float64]
 KINDS = ("physical", "paper_ideal")
 AIR = "air"  # material of the part of a ray that lies in no obstacle
 OPAQUE_1_M = 1e6  # attenuation of a detector that counts every photon that meets it
-SPECTRUM_BINS = 28
-"""Bins of scattered photons, of equal width in ln(energy), in which spectra behind walls are put together."""
-SPECTRUM_DEPTHS = (1.0, 5.0)
-"""Mean free paths for which the energies of scattered photons are tabulated."""
 
 
 @pytree
@@ -75,7 +82,10 @@ class Detector:
     scattered_rois: jax.Array  # [N, depths, M, L, R] share of the scattered counts in each
     ground_rois: jax.Array  # [N, L, R] share of the counts from the ground in each
     background_rois: jax.Array  # [R] cps, sums to background_cps
-    grid_spectrum: jax.Array  # [grid, channels] spectra of lines half a resolution (FWHM) apart, each sums to 1
+    peak_orders: jax.Array  # [N, L, GAINS, ORDERS, bins] peak_spectrum by bin at any gain and width (lines.orders)
+    bin_orders: jax.Array  # [SPECTRUM_BINS, GAINS, ORDERS, bins] bin_spectrum likewise
+    natural_orders: jax.Array  # [GAINS, 2, ORDERS, bins] the background's shape, and that times lines.tilt
+    grid_spectrum: jax.Array  # [shields, grid, bins] of lines half a FWHM apart behind walls; sum to 1
     background_spectrum: jax.Array  # [channels] cps, sums to background_cps
     energy_kev: jax.Array  # [channels] centre of each channel
     sigma_kev: jax.Array  # [channels] standard deviation of a peak there
@@ -116,8 +126,9 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
     area = area * (counting.counts(energy) * counting.through_housing(energy))[..., None]
     nodes = np.geomspace(mu.min(), max(mu.max(), 1.01 * mu.min()), NEAR_TABLES)
     axis = np.asarray(mount.axis) / np.linalg.norm(mount.axis)
-    attenuation, coefficients, bins = _transport(library, energy, kind, counting, (radius, length))
-    ground, ground_bins = _ground(energy, kind, counting, (radius, length))
+    counted = (lambda e: _mean_area(counting, e, (radius, length))) if kind == "physical" else None
+    attenuation, coefficients, bins = _transport(library, energy, counted)
+    ground, ground_bins = _ground(energy, counted)
     f32 = on_device
     return Detector(
         radius_m=f32(radius),
@@ -142,7 +153,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         nuclide_names=library.nuclide_names,
         material_names=library.material_names,
         kind=kind,
-        **_spectra(spec, response, energy, bins, ground_bins),
+        **_spectra(spec, library, response, energy, bins, ground_bins, counted),
     )
 
 
@@ -158,7 +169,7 @@ def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
     lines = int(np.max(np.sum(np.asarray(detector.yields)[rows] > 0, axis=1)))
     second = (
         "yields", "effective_area_m2", "near_share", "attenuation_1_m", "peak_spectrum", "peak_rois", "line_energy_kev",
-        "ground", "ground_bins", "ground_rois",
+        "ground", "ground_bins", "ground_rois", "peak_orders",
     )  # fmt: skip
     last_but_one = ("scatter_1_m", "scattered_bins", "scattered_rois")
     tables = {name: getattr(detector, name)[rows, :lines] for name in second}
@@ -200,32 +211,29 @@ def _shares(value: Floats, nodes: Floats) -> Floats:
 
 
 def _transport(
-    library: Library, energy: Floats, kind: str, counting: Counting, size: tuple[float, float]
+    library: Library, energy: Floats, counted: Callable[[Floats], Floats] | None
 ) -> tuple[Floats, Floats, Floats]:
     """The fields attenuation_1_m, scatter_1_m and scattered_bins of a detector."""
-    physical = kind == "physical"
-    tables = scattering.transport(
-        library.materials, energy, (lambda e: _mean_area(counting, e, size)) if physical else None
-    )
+    tables = scattering.transport(library.materials, energy, counted)
     attenuation, row = tables.attenuation_1_m, tables.row
     bins = np.zeros((len(tables.energy_kev), len(SPECTRUM_DEPTHS), len(library.materials), SPECTRUM_BINS))
-    if physical:
+    if counted is not None:
         energies = scattering.bin_energies(tables.energy_kev)
         for m in range(len(library.materials)):
-            bins[:, :, m] = np.moveaxis(_energy_shares(tables.counts[:, m, :, 0], energies), 1, 0)
+            bins[:, :, m] = np.moveaxis(energy_shares(tables.counts[:, m, :, 0], energies), 1, 0)
     else:
         attenuation = attenuation * [material.name != AIR for material in library.materials]
     # from [N, L, ...] to the places of the lines in the fields
     return attenuation[row], np.moveaxis(tables.scatter_1_m[row], 1, 3), np.moveaxis(bins[row], 1, 3)
 
 
-def _ground(energy: Floats, kind: str, counting: Counting, size: tuple[float, float]) -> tuple[Floats, Floats]:
+def _ground(energy: Floats, counted: Callable[[Floats], Floats] | None) -> tuple[Floats, Floats]:
     """The fields ground and ground_bins of a detector."""
     flat, row = np.unique(energy, return_inverse=True)
-    if kind == "paper_ideal":
+    if counted is None:
         return np.zeros((*energy.shape, 2)), np.full((*energy.shape, SPECTRUM_BINS), 1.0 / SPECTRUM_BINS)
-    found, counts = from_ground(flat, lambda e: _mean_area(counting, e, size))
-    shares = normalised(_rebinned(counts, scattering.bin_energies(flat)))
+    found, counts = from_ground(flat, counted)
+    shares = normalised(in_spectrum_bins(counts, scattering.bin_energies(flat)))
     return found[row].reshape(*energy.shape, -1), shares[row].reshape(*energy.shape, -1)
 
 
@@ -240,29 +248,14 @@ def _mean_area(counting: Counting, energy: Floats, size: tuple[float, float]) ->
     return np.asarray(seen * counting.counts(energy) * counting.through_housing(energy))
 
 
-def _energy_shares(counts: Floats, energies: Floats) -> Floats:
-    """Shares [depths, k, SPECTRUM_BINS] of the scattered counts [k, d, BINS] by energy, at `SPECTRUM_DEPTHS`."""
-    rows = [int(np.argmin(np.abs(scattering.depths() - depth))) for depth in SPECTRUM_DEPTHS]
-    return normalised(np.stack([_rebinned(counts[:, row], energies) for row in rows]))
-
-
-def _rebinned(counts: Floats, energies: Floats) -> Floats:
-    """Counts [k, BINS] in bins with the middles ``energies`` [k, BINS] in those of the spectrum [k, SPECTRUM_BINS]."""
-    relative = np.log(energies / scattering.CUT_KEV)  # [k, BINS] middles
-    width = 2.0 * relative[:, :1]
-    low, high = relative - 0.5 * width, relative + 0.5 * width
-    log_edges = np.log(spectrum_edges() / scattering.CUT_KEV)
-    below = np.clip((log_edges - low[..., None]) / (high - low)[..., None], 0.0, 1.0)
-    return np.einsum("kb,kbs->ks", counts, np.diff(below, axis=-1))
-
-
-def spectrum_edges() -> Floats:
-    """Edges [SPECTRUM_BINS + 1] in keV of the bins of scattered photons."""
-    return np.geomspace(scattering.CUT_KEV, 3000.0, SPECTRUM_BINS + 1)
-
-
 def _spectra(
-    spec: DetectorSpec, response: Response | None, energy: Floats, bins: Floats, ground_bins: Floats
+    spec: DetectorSpec,
+    library: Library,
+    response: Response | None,
+    energy: Floats,
+    bins: Floats,
+    ground_bins: Floats,
+    counted: Callable[[Floats], Floats] | None,
 ) -> dict[str, Any]:
     """The fields of a detector that have channels; a counter without energy resolution has one channel."""
     f32 = on_device
@@ -274,7 +267,10 @@ def _spectra(
             "scattered_rois": f32(np.ones((*bins.shape[:-1], 1))),
             "ground_rois": f32(np.ones((*energy.shape, 1))),
             "background_rois": f32(np.array([spec.background.rate_cps])),
-            "grid_spectrum": f32(np.ones((1, 1))),
+            "peak_orders": f32(np.zeros((*energy.shape, 1, 1, 1))),
+            "bin_orders": f32(np.zeros((SPECTRUM_BINS, 1, 1, 1))),
+            "natural_orders": f32(np.zeros((1, 2, 1, 1))),
+            "grid_spectrum": f32(np.ones((1, 1, 1))),
             "background_spectrum": f32(np.array([spec.background.rate_cps])),
             "energy_kev": f32(np.array([662.0])),
             "sigma_kev": f32(np.array([662.0])),
@@ -286,11 +282,17 @@ def _spectra(
     peaks = normalised(line_spectra(response, flat))
     of_bins = normalised(line_spectra(response, np.sqrt(edges[1:] * edges[:-1])))
     background = background_spectrum(response, spec.background)
+    shape = normalised(background[None])[0]
+    natural = orders(response, shape * np.stack([np.ones_like(shape), tilt(response.channel_centre_kev)]))
+    peak_orders = orders(response, peaks)[back].reshape(*energy.shape, len(GAINS), ORDERS, -1)
     rois = rois_of(response, spec.spectrometer.rois_kev)
     return {
         "peak_spectrum": f32(peaks[back].reshape(*energy.shape, -1)),
         "bin_spectrum": f32(of_bins),
-        "grid_spectrum": f32(normalised(line_spectra(response, _line_grid(response)))),
+        "peak_orders": f32(peak_orders),
+        "bin_orders": f32(orders(response, of_bins)),
+        "natural_orders": f32(np.swapaxes(natural, 0, 1)),
+        "grid_spectrum": f32(shielded_lines(response, library.materials, counted)),
         "peak_rois": f32((peaks @ rois)[back].reshape(*energy.shape, -1)),
         "scattered_rois": f32(bins @ of_bins @ rois),
         "ground_rois": f32(ground_bins @ of_bins @ rois),
@@ -298,7 +300,7 @@ def _spectra(
         "background_spectrum": f32(background),
         "energy_kev": f32(response.channel_centre_kev),
         "sigma_kev": f32(response.sigma_kev(response.channel_centre_kev)),
-        "identification_bins": _identification_bins(response),
+        "identification_bins": identification_bins(response),
     }
 
 
@@ -310,22 +312,3 @@ def rois_of(response: Response, edges_kev: tuple[float, ...]) -> Floats:
 def region_of(energy_kev: Floats, edges_kev: tuple[float, ...]) -> NDArray[np.int64]:
     """Number of the region of each energy [...]; those below the first and above the last go to these."""
     return np.clip(np.searchsorted(edges_kev, energy_kev) - 1, 0, len(edges_kev) - 2)
-
-
-def _line_grid(response: Response) -> Floats:
-    """Energies half a resolution (FWHM) apart, from the threshold to the end of the response and the channels."""
-    low, high = response.threshold_kev, min(response.channel_edge_kev[-1], ENERGIES_KEV[-1])
-    # FWHM grows as the root of the energy, so that the roots of the energies lie at equal distances
-    step = 0.25 * float(response.sigma_kev(np.asarray(low))) / SIGMA_PER_FWHM / np.sqrt(low)
-    return np.linspace(np.sqrt(low), np.sqrt(high), round((np.sqrt(high) - np.sqrt(low)) / step) + 1) ** 2
-
-
-def _identification_bins(response: Response) -> tuple[int, ...]:
-    """First channels of bins a third of the resolution (FWHM) wide, from the threshold, and the end of the last bin."""
-    starts = [int(np.searchsorted(response.channel_edge_kev, response.threshold_kev))]
-    end = len(response.channel_centre_kev)
-    while starts[-1] < end:
-        energy = response.channel_edge_kev[starts[-1]]
-        fwhm = response.sigma_kev(np.asarray(energy)) / SIGMA_PER_FWHM
-        starts.append(min(end, starts[-1] + max(1, round(float(fwhm) / 3 / response.channel_width_kev))))
-    return tuple(starts)

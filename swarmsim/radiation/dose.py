@@ -9,9 +9,10 @@ from swarmsim.config.radiation import Nuclide
 from swarmsim.pytree import on_device
 from swarmsim.radiation import scattering
 from swarmsim.radiation.cylinder import NEAR_COLUMNS, NEAR_ROWS, NEAR_TABLES
-from swarmsim.radiation.detector import SPECTRUM_BINS, Detector, lines_of
+from swarmsim.radiation.detector import Detector, lines_of
 from swarmsim.radiation.ground import from_ground
 from swarmsim.radiation.library import Library
+from swarmsim.radiation.lines import SPECTRUM_BINS
 
 Floats = NDArray[np.float64]
 Quantity = Literal["ambient_dose_equivalent", "air_kerma"]
@@ -83,7 +84,10 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
         scattered_rois=f32(np.ones((*bins.shape[:-1], 1))),
         background_rois=f32(np.zeros(1)),
         bin_spectrum=f32(np.ones((SPECTRUM_BINS, 1))),
-        grid_spectrum=f32(np.ones((1, 1))),
+        peak_orders=f32(np.zeros((*energy.shape, 1, 1, 1))),
+        bin_orders=f32(np.zeros((SPECTRUM_BINS, 1, 1, 1))),
+        natural_orders=f32(np.zeros((1, 2, 1, 1))),
+        grid_spectrum=f32(np.ones((1, 1, 1))),
         background_spectrum=f32(np.zeros(1)),
         energy_kev=f32([662.0]),
         sigma_kev=f32([662.0]),

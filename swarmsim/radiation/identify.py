@@ -1,62 +1,49 @@
 """Bayesian identification of the nuclides in a spectrum (device side).
 
 The hypotheses: background only; one nuclide; two or three nuclides; something that the library does not hold, which is
-any non-negative sum of lines of the detector's own shape. Under each, the spectrum is a non-negative sum of templates:
-the background (amplitude and tilt free), and for each nuclide its spectrum bare, above the ground, in air, and behind
-concrete, steel and lead (`swarmsim.radiation.templates`). All nuclides are fitted alone; each other is added to the
-best two, and a third to the best pair. The best of each number are fitted at a gain and a resolution of their own
-(`swarmsim.radiation.fits`): those of one nuclide that is fitted to a mixture are not those of the mixture.
-Posterior = likelihood x Occam factor of each source's strength x prior, where each bin's deviance is reduced to account
-for the error of the templates. Free lines fit better than the truth does, by about a chi-squared number whose degrees
-of freedom grow with the lines that the resolution separates; they are charged for it.
+a few lines of any energies. A nuclide is bare, above the ground, or behind one of many shields (water, concrete, steel,
+lead of some depth, air), with more or fewer scattered photons than that would make; so are lines.
+The evidence of each hypothesis is the mean of the likelihood over shields, strengths, gain, resolution and background
+(`swarmsim.radiation.laplace`), so that what explains more spectra is not preferred for fitting one of them.
+Posterior = evidence x prior, where each bin's deviance is reduced to account for the error of the templates.
 """
 
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import logsumexp
 
 from swarmsim.config.errors import InputError
 from swarmsim.pytree import pytree
 from swarmsim.radiation.detector import Detector
-from swarmsim.radiation.fits import (
-    GAINS,
-    WIDTHS,
-    Binned,
-    Data,
-    Fits,
-    binned_data,
-    binned_templates,
-    expected_counts,
-    fit,
-    log_occam,
-    loss,
-    maximise,
-    refine,
-)
 from swarmsim.radiation.goodness import p_value
-from swarmsim.radiation.templates import NATURAL, Templates, rebinned, templates, widened
+from swarmsim.radiation.laplace import COLUMNS, GAIN_STD, NATURAL, PARTS, SOURCES, Data, Fit, binned_data, laplace
+from swarmsim.radiation.lines import GAINS
+from swarmsim.radiation.pursuit import (
+    Found,
+    Sources,
+    bin_weights,
+    natural_slopes,
+    of_library,
+    screen,
+    strangers,
+    strengths,
+    with_new,
+)
+from swarmsim.radiation.templates import Tables, shield_shares, tables
 
 NONE, UNKNOWN = -1, -2
 """What `Identification.nuclide` is where no nuclide is named: background only, or a source not in the library."""
-_COARSE = 2  # every so many gains of the tables all nuclides are fitted
-_FREE_GAINS = (2, 6, 10)  # of GAINS, at which free lines are fitted: their energies are free anyway
-CANDIDATES = 5  # best single nuclides, which are fitted to the end
-REFINED = 4  # best mixtures, which are fitted to the end
-FIRSTS = 2  # best single nuclides to which each other is added
+CANDIDATES = 10  # sources that are fitted in full at each stage
+_SHIELDS_EACH = 3  # of one nuclide among them
 # Prior: a hotspot may be natural background, may be no nuclide of the library, and is rarely a mixture.
 _PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.1, 0.4, 0.08, 0.02
-_SHAPE_ERROR = 0.04  # relative error of a nuclide's whole shape, which free lines do not have: an estimate
-_FREE_ITERATIONS = 120
-_FREE_MEAN, _FREE_GRID = 48.0, 110
-"""By how much the deviance of free lines is smaller than that of the true nuclide, on a grid of so many lines: mean
-over random spectra of 300 and 1000 counts of the library behind walls. Its spread there is that of chi-squared."""
-_FREE_SIGMAS = 1.75  # by so many standard deviations must it be smaller than that: one in 25 is, by chance
+_BASE_SIZE = (0, 1, 1, 2)  # nuclides of the base of each stage
 _MODEL_ERROR = 0.015
-"""Relative error of an expected spectrum in a bin, for the goodness of fit. Sums of the templates differ from spectra
-behind random walls by 4 to 5 % of the source's counts (root mean square over nuclides), a third of which it is of all
-counts where the background is twice the source."""
+"""Relative error of an expected spectrum in a bin, for the goodness of fit: an estimate."""
 
 
 @pytree
@@ -75,6 +62,25 @@ class Identification:
     fit: jax.Array  # [channels] expected counts of that hypothesis
 
 
+class _Base(NamedTuple):
+    """A fitted hypothesis of the library."""
+
+    sources: Sources
+    fit: Fit
+    log_prior: jax.Array  # [] of the shields of its sources, and of the number of others that fit about as well
+
+
+class _Stage(NamedTuple):
+    """Hypotheses of a base and one nuclide more."""
+
+    score: jax.Array  # [N] logarithm of the evidence of each
+    base: jax.Array  # [N] 1 for the nuclides of the base
+    best: _Base  # the best of them all
+    share: jax.Array  # [2, N] counts of each nuclide of the base, and of any nuclide that is added, over all of both
+    base_fit: Fit
+    strangers: jax.Array  # [] logarithm of the evidence of strangers
+
+
 def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identification:
     """Identify the nuclides in ``counts`` [channels] accumulated over ``live_s`` [] seconds.
 
@@ -84,99 +90,137 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
     if not detector.identification_bins:
         raise InputError.of("a counter without energy resolution tells no nuclides apart: use a scintillator")
     n = len(detector.nuclide_names)
-    fine = templates(detector)
-    binned = binned_templates(detector, fine)
-    data = binned_data(detector, counts, live_s)
-    groups = [(_background_only(binned, data), _PRIOR_NONE, 1), (_singles(binned, data), _PRIOR_ONE, n)]
-    for prior, count, firsts in ((_PRIOR_TWO, 2, FIRSTS), (_PRIOR_THREE, 3, 1)):
-        if n >= count:
-            before = groups[-1][0]
-            best = before.at(jax.lax.top_k(before.score, min(firsts, n))[1])
-            groups.append((_with_another(binned, data, best, count), prior, math.comb(n, count)))
-    library = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *(fits for fits, _, _ in groups))
-    priors = np.concatenate([np.full(len(fits.score), math.log(p / number)) for fits, p, number in groups])
-    free = _free_lines(binned, data) + math.log(_PRIOR_UNKNOWN)
-    chance = jax.nn.softmax(jnp.append(library.score + priors, free))
-    present, none, unknown = chance[:-1] @ library.members, chance[0], chance[-1]
-    best = library.at(jnp.argmax(library.score + priors))
-    strength = jnp.sum(library.weights, axis=2)
-    share = strength / jnp.maximum(jnp.sum(strength, axis=1, keepdims=True), 1e-9)
-    main = jnp.argmax(chance[:-1] @ (share * library.members))
-    nothing = jnp.where(unknown > none, UNKNOWN, NONE)
-    named = present[main] > jnp.maximum(none, unknown)
-    expected = expected_counts(binned, best)
-    fitted = 4.0 + 2.0 * jnp.sum(best.members)  # background, tilt, gain and width; strength and shield of each
+    table, data = tables(detector), binned_data(detector, counts, live_s)
+    stages = _stages(table, data, jnp.asarray(np.log(shield_shares(detector)), jnp.float32), n)
+    prior = (
+        _PRIOR_ONE / n,
+        *(p / max(math.comb(n, k), 1) for p, k in ((0.5 * _PRIOR_TWO, 2),) * 2 + ((_PRIOR_THREE, 3),)),
+    )
+    log_prior = np.log([p if n > k else 1e-30 for p, k in zip(prior, _BASE_SIZE, strict=True)])
+    score = stages.score + log_prior[:, None]  # [stages, N]
+    none, unknown = stages.base_fit.score[0] + math.log(_PRIOR_NONE), stages.strangers[0] + math.log(_PRIOR_UNKNOWN)
+    chance = jax.nn.softmax(jnp.concatenate([score.ravel(), jnp.stack([none, unknown])]))
+    added, none_chance, unknown_chance = chance[:-2].reshape(score.shape), chance[-2], chance[-1]
+    of_base = jnp.sum(added, axis=1)
+    present = of_base @ stages.base + jnp.sum(added, axis=0)
+    main = jnp.argmax(of_base @ stages.share[:, 0] + jnp.sum(added * stages.share[:, 1], axis=0))
+    nothing = jnp.where(unknown_chance > none_chance, UNKNOWN, NONE)
+    other = jnp.maximum(none_chance, unknown_chance)
+    named = present[main] > other
+    value = jnp.append(stages.best.fit.score + stages.best.log_prior + log_prior, none)
+    last = jnp.argmax(value)
+    fits = jax.tree.map(lambda a, b: jnp.concatenate([a, b[:1]]), stages.best.fit, stages.base_fit)
+    nobody = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), stages.best.sources)
+    best, sources = jax.tree.map(lambda leaf: leaf[last], (fits, nobody))
+    each = jnp.sum(strengths(best), axis=1) * sources.present
+    # background, tilt, gain and width; strength, shield and scattered photons of each
+    fitted = 4.0 + 3.0 * jnp.sum(sources.present)
+    shields = table.sources.shape[0] // n
     return Identification(
         nuclide=jnp.where(named, main, nothing).astype(jnp.int32),
-        confidence=jnp.where(named, present[main], jnp.maximum(none, unknown)),
+        confidence=jnp.where(named, present[main], other),
         posterior=present,
-        none=none,
-        unknown=unknown,
-        strength_cps=jnp.sum(best.weights, axis=1) / jnp.maximum(live_s, 1e-3),
+        none=none_chance,
+        unknown=unknown_chance,
+        strength_cps=jnp.zeros(n).at[sources.row // shields].add(each) / jnp.maximum(live_s, 1e-3),
         gain=best.gain,
-        width=best.width,
-        goodness=p_value(data.counts, expected, data.certainty, fitted, _MODEL_ERROR),
-        fit=_in_channels(detector, fine, best),
+        width=jnp.sqrt(1.0 + 2.0 * best.time),
+        goodness=p_value(data.counts, best.expected, data.certainty, fitted, _MODEL_ERROR),
+        fit=_in_channels(detector, best.expected),
     )
 
 
-def _background_only(binned: Binned, data: Data) -> Fits:
-    """Fit of the background at its best gain and width: one hypothesis."""
-    gains = jnp.asarray(GAINS[::_COARSE])
-    nothing = jnp.zeros((len(gains), 0), jnp.int32)
-    coarse = fit(binned, data, nothing, gains, jnp.ones(len(gains)))
-    best = jnp.argmax(coarse.score)[None]
-    return refine(binned, data, nothing[:1], coarse.gain[best], coarse.width[best])
+def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stage:
+    """All stages: one nuclide; another with the best; another with that one alone; a third with the best two."""
+    shields = table.sources.shape[0] // n
+    weight, slopes = bin_weights(table, data), natural_slopes(table, data)
+    row_prior = jnp.tile(shield_prior, n)
+    gains = jnp.arange(len(GAINS))
+    gain_prior = -0.5 * ((jnp.asarray(GAINS) - 1.0) / GAIN_STD) ** 2
+    nobody = Sources(jnp.zeros(SOURCES, jnp.int32), jnp.zeros(SOURCES), jnp.zeros(SOURCES))
+
+    def added_to(own: Sources, counts: jax.Array) -> Found:
+        """Candidates at all gains, whose amplitudes follow; ``counts`` [COLUMNS] are those of the base."""
+        about = jax.vmap(lambda gain: of_library(table, data, own, gain))(gains)
+        shape = about.column[:, :, 0]  # [gains, COLUMNS, bins]
+        slope = about.scale[..., None] * shape
+        return screen(table, data, weight, jnp.einsum("c,gcb->gb", counts, shape), slope, gain_prior)
+
+    alone = jnp.zeros(COLUMNS).at[0].set(data.natural)
+    other = strangers(table, data, weight, slopes, added_to(nobody, alone).base_gain)
+
+    def stage(bases: _Base, k: jax.Array) -> tuple[_Base, _Stage]:
+        base = jax.tree.map(lambda leaf: leaf[k], bases)
+        size = jnp.asarray(_BASE_SIZE)[k]
+        own = Sources(base.sources.row, base.sources.present, jnp.sum(strengths(base.fit), axis=1))
+        found = added_to(own, base.fit.counts)
+        in_base = jnp.zeros(n).at[base.sources.row // shields].max(base.sources.present)
+        again = in_base > 0.0
+        ranked = found.score + row_prior + jnp.where(jnp.repeat(again, shields), -1e6, 0.0)
+        by_nuclide, which = jax.lax.top_k(ranked.reshape(n, shields), _SHIELDS_EACH)
+        few = jax.lax.top_k(by_nuclide.ravel(), min(CANDIDATES, n * _SHIELDS_EACH))[1]
+        row = few // _SHIELDS_EACH * shields + which.ravel()[few]
+        # the first two at the neighbouring gains too: to second order the base may point to a wrong one
+        at = jnp.concatenate([found.gain[row], (found.gain[row[:2]][:, None] + jnp.array([-1, 1])).ravel()])
+        row = jnp.concatenate([row, jnp.repeat(row[:2], 2)])
+        candidates = jax.vmap(lambda r: with_new(own, size, r, found.strength[r]))(row)
+        hypotheses = [
+            jax.vmap(lambda s, g: of_library(table, data, s, g))(candidates, jnp.clip(at, 0, len(GAINS) - 1)),
+            jax.tree.map(lambda leaf: leaf[None], of_library(table, data, own, found.base_gain)),
+            other.hypotheses,
+        ]
+        fits = jax.vmap(lambda h: laplace(h, data))(jax.tree.map(lambda *a: jnp.concatenate(a), *hypotheses))
+        many, first_many = row.shape[0], few.shape[0]
+        fitted = fits.score[:many] + row_prior[row]
+        # what is not fitted is off by as much as what is
+        shift = logsumexp(fitted[:first_many]) - logsumexp(ranked[row[:first_many]])
+        scores = (ranked + shift).at[row].set(-jnp.inf)
+        scores = scores.at[row].max(fitted + jnp.where(again[row // shields], -1e6, 0.0))
+        evidence = logsumexp(scores.reshape(n, shields), axis=1)
+        best = jnp.argmax(fitted)
+
+        sources, fit = jax.tree.map(lambda leaf: leaf[best], (candidates, jax.tree.map(lambda leaf: leaf[:many], fits)))
+        winner = _Base(sources, fit, base.log_prior + evidence[row[best] // shields] - fit.score)
+        counts = jnp.sum(strengths(winner.fit), axis=1) * winner.sources.present
+        counts /= jnp.maximum(jnp.sum(counts), 1e-9)
+        new = counts[size]
+        old = jnp.zeros(n).at[base.sources.row // shields].add(counts * base.sources.present)
+        stranger_score = fits.score[many + 1 :] + other.places
+        extra = logsumexp(stranger_score) - logsumexp(other.score)
+        out = _Stage(
+            score=evidence + base.log_prior,
+            base=in_base,
+            best=winner,
+            share=jnp.stack([old, jnp.full(n, new)]),
+            base_fit=jax.tree.map(lambda leaf: leaf[many], fits),
+            strangers=other.total + extra,
+        )
+        better = (k == 1) | (winner.fit.score + winner.log_prior > bases.fit.score[3] + bases.log_prior[3])
+        # the nuclide that was added to the first one, alone: so that the first one's shield is found again beside it
+        parts = strengths(winner.fit)[size]
+        lone = _Base(
+            Sources(*(jnp.zeros_like(leaf).at[0].set(leaf[size]) for leaf in winner.sources)),
+            winner.fit._replace(counts=jnp.zeros(COLUMNS).at[:NATURAL].set(winner.fit.counts[:NATURAL])),
+            winner.log_prior - base.log_prior,
+        )
+        lone = lone._replace(fit=lone.fit._replace(counts=lone.fit.counts.at[NATURAL : NATURAL + PARTS].set(parts)))
+        for place, new_base in (
+            (jnp.where(k == 0, 1, jnp.where((k < 3) & better, 3, 4)), winner),
+            (jnp.where(k == 1, 2, 4), lone),
+        ):
+            bases = jax.tree.map(lambda all_of, one, p=place: all_of.at[p].set(one), bases, new_base)
+        return bases, out
+
+    bins = data.counts.shape[0]
+    zero = jnp.zeros(())
+    empty = _Base(nobody, Fit(zero, alone, zero + 1.0, zero, jnp.zeros(bins)), zero)
+    start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (5, *leaf.shape)), empty)
+    return jax.lax.scan(stage, start, jnp.arange(len(_BASE_SIZE)))[1]
 
 
-def _singles(binned: Binned, data: Data) -> Fits:
-    """Fits of each nuclide alone: all at every `_COARSE`-th gain, the best at the best gain and width."""
-    n, gains = binned.nuclides.shape[2], jnp.asarray(GAINS[::_COARSE])
-    number = jnp.tile(jnp.arange(n), len(gains))[:, None]
-    coarse = fit(binned, data, number, jnp.repeat(gains, n), jnp.ones(len(number)))
-    best = jnp.argmax(coarse.score.reshape(len(gains), n), axis=0)
-    coarse = coarse.at(best * n + jnp.arange(n))
-    top = jax.lax.top_k(coarse.score, min(CANDIDATES, n))[1]
-    finer = refine(binned, data, top[:, None], coarse.gain[top], coarse.width[top])
-    return jax.tree.map(lambda all_of, some: all_of.at[top].set(some), coarse, finer)
-
-
-def _with_another(binned: Binned, data: Data, firsts: Fits, count: int) -> Fits:
-    """Fits of each of ``firsts`` together with each other nuclide, ``count`` in all, the best at their gain and width.
-
-    A set that comes twice, or a nuclide added to itself, has a score of -inf.
-    """
-    n, rows = firsts.members.shape[1], firsts.members.shape[0]
-    first = jax.lax.top_k(firsts.members, count - 1)[1]  # [rows, count - 1]
-    chosen = jnp.concatenate([jnp.repeat(first, n, axis=0), jnp.tile(jnp.arange(n), rows)[:, None]], axis=1)
-    fits = fit(binned, data, chosen, jnp.repeat(firsts.gain, n), jnp.repeat(firsts.width, n))
-    same = jnp.all(fits.members[:, None] == fits.members, axis=-1)
-    again = jnp.any(same & (jnp.arange(rows * n)[:, None] > jnp.arange(rows * n)), axis=1)
-    few = jnp.sum(fits.members, axis=1) < count
-    fits = fits._replace(score=jnp.where(again | few, -jnp.inf, fits.score))
-    score, top = jax.lax.top_k(fits.score, min(REFINED, rows * n))
-    finer = refine(binned, data, chosen[top], fits.gain[top], fits.width[top])
-    finer = finer._replace(score=jnp.where(jnp.isfinite(score), finer.score, -jnp.inf))
-    return jax.tree.map(lambda all_of, some: all_of.at[top].set(some), fits, finer)
-
-
-def _free_lines(binned: Binned, data: Data) -> jax.Array:
-    """Score [] of a source of any energies: free lines of the detector's own shape."""
-    some = np.array(_FREE_GAINS)
-    natural = binned.background[some, WIDTHS.index(1.0)]
-    shape = jnp.concatenate([natural, binned.lines[some]], axis=1)
-    weights = maximise(shape, data, _FREE_ITERATIONS)
-    losses = loss(shape, weights, data)
-    best = jnp.argmin(losses)
-    sources = weights[best, None, NATURAL:]
-    occam = log_occam(shape[best, None, NATURAL:], sources, data, weights[best] @ shape[best])[0]
-    freedom = _FREE_MEAN * binned.lines.shape[1] / _FREE_GRID
-    charge = freedom + _FREE_SIGMAS * math.sqrt(2.0 * freedom) + _SHAPE_ERROR**2 * jnp.sum(sources)
-    return occam - 0.5 * (losses[best] + charge)
-
-
-def _in_channels(detector: Detector, fine: Templates, best: Fits) -> jax.Array:
-    """Expected counts [channels] of one hypothesis."""
-    drawn = best.background @ fine.background + jnp.einsum("ns,nsc->c", best.weights, fine.nuclides)
-    moved = rebinned(detector, widened(detector, drawn, best.width), best.gain, np.arange(drawn.shape[0] + 1))
-    return jnp.where(np.arange(drawn.shape[0]) < detector.identification_bins[0], 0.0, moved)
+def _in_channels(detector: Detector, expected: jax.Array) -> jax.Array:
+    """Expected counts [channels] where those of the bins are ``expected`` [bins]: linear between their middles."""
+    edges = np.asarray(detector.identification_bins)
+    channel = np.arange(detector.energy_kev.shape[0])
+    per_channel = jnp.interp(channel + 0.5, 0.5 * (edges[1:] + edges[:-1]), expected / np.diff(edges))
+    return jnp.where(channel < edges[0], 0.0, per_channel)

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.radiation.cylinder import direction_basis, near_ratio
-from swarmsim.radiation.detector import AIR, SPECTRUM_DEPTHS, Detector, Source
+from swarmsim.radiation.detector import AIR, Detector, Source
+from swarmsim.radiation.lines import SPECTRUM_DEPTHS
 from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.walls import Scattered, scattered_counts
 from swarmsim.site.rays import Crossed

@@ -3,6 +3,8 @@
 A gain g records the pulses of channel e in channel g e. The resolution changes as by heat conduction: a peak of
 variance v(E) is the pulse heights after diffusion, and dS/dv is half the second derivative, so that a relative width
 rho adds t A S + t^2 A^2 S / 2 with A S = d2(v S)/dE2 and t = (rho^2 - 1) / 2. This narrows as well as it broadens.
+Spectra of lines and of scattered photons are tabulated by bins at some gains with these changes when a detector is
+built (host side); what is left for the device is to add them up behind each shield.
 """
 
 from typing import NamedTuple
@@ -10,77 +12,107 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from swarmsim.radiation.cylinder import direction_basis
 from swarmsim.radiation.detector import AIR, Detector
+from swarmsim.radiation.lines import GROUND, SHIELDS
 from swarmsim.radiation.rate import from_ground, scattered_shares, transmission
 from swarmsim.site.rays import Crossed, Shape
 
-SHIELDS = ("concrete", "steel", "lead")
-DEPTHS = (0.3, 1.3, 4.0)
-"""Optical depths of the shields of the templates; sums of them and of the bare spectrum cover 0 to 4. The least stops
-the X-rays and little else."""
-AIR_M = (30.0, 100.0)
-"""Lengths of the ways in air of the templates; the longest is also that of templates behind the deepest shields."""
-TILT = 0.2
-"""Relative change of the background's shape at both ends of the energies in its two templates."""
-NATURAL = 2
-"""Templates of the background."""
-_TILT_KEV = (30.0, 3000.0)
-_SEARCH_STEPS = 40
+DEPTHS = (0.4, 1.1, 1.9, 2.9, 4.1)
+"""Optical depths of the shields of the templates. The least stops the X-rays and little else."""
+AIR_M = (60.0,)
+"""Lengths of the ways in air of the templates."""
+_BARE_SHARE, _GROUND_SHARE, _AIR_SHARE = 0.2, 0.2, 0.1  # of the prior of the shields; all walls share the rest
+_SEARCH_STEPS = 30
 
 
-class Templates(NamedTuple):
-    """Templates by channel; each sums to 1 above the threshold."""
+class Tables(NamedTuple):
+    """Spectra in the bins of identification, by order of `swarmsim.radiation.lines.orders`: gain, and width."""
 
-    background: jax.Array  # [2, channels] tilted down and up
-    nuclides: jax.Array  # [N, shields, channels] bare first
-    lines: jax.Array  # [grid, channels] free lines
+    background: jax.Array  # [gains, 2, orders, bins] as it is, sums to 1, and times `tilt`
+    sources: jax.Array  # [N shields, gains, orders, bins] sum to 1
+    scattered: jax.Array  # [N shields, gains, orders, bins] the part of scattered photons
+    lines: jax.Array  # [shields, grid, bins]
 
 
-def templates(detector: Detector) -> Templates:
-    """Templates of every nuclide of a detector with energy resolution."""
+def shields(detector: Detector) -> list[tuple[int, float, float, float]]:
+    """Material, optical depth, length of air and ground of every shield of the templates, bare first."""
     names = detector.material_names
     walls = [names.index(name) for name in SHIELDS if name in names] or [0]
-    layers = [(wall, depth, 0.0, 0.0) for wall in walls for depth in DEPTHS] + [(walls[0], 0.0, 0.0, 1.0)]
-    if AIR in names:
-        layers += [(walls[0], 0.0, length, 0.0) for length in AIR_M]
-        layers += [(wall, DEPTHS[-1], AIR_M[-1], 0.0) for wall in walls]
+    ground = [(walls[0], 0.0, 0.0, GROUND)] if detector.kind == "physical" else []
+    air = [(walls[0], 0.0, length, 0.0) for length in AIR_M if AIR in names]
+    return [(walls[0], 0.0, 0.0, 0.0), *ground, *air, *((wall, depth, 0.0, 0.0) for wall in walls for depth in DEPTHS)]
+
+
+def shield_shares(detector: Detector) -> NDArray[np.float64]:
+    """Prior [shields] of each shield."""
+    wall, air, ground = (np.array(column) > 0.0 for column in list(zip(*shields(detector), strict=True))[1:])
+    walls = 1.0 - _BARE_SHARE - _GROUND_SHARE - _AIR_SHARE
+    share = walls * wall / wall.sum() + _AIR_SHARE * air / max(air.sum(), 1) + _GROUND_SHARE * ground
+    share[0] = _BARE_SHARE
+    return np.asarray(share / share.sum())
+
+
+def tables(detector: Detector) -> Tables:
+    """Spectra of every nuclide of a detector with energy resolution behind every shield."""
+    names, n = detector.material_names, len(detector.nuclide_names)
     is_air = jnp.array([name == AIR for name in names])
 
-    def of_nuclide(number: jax.Array) -> jax.Array:
-        def behind(layer: jax.Array) -> jax.Array:
-            wall = layer[0].astype(jnp.int32)
-            thickness = thickness_m(detector, number, wall, layer[1])
-            length_m = thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air
-            return shielded(detector, number, length_m, layer[3])
+    def behind(number: jax.Array, layer: jax.Array) -> tuple[jax.Array, jax.Array]:
+        wall = layer[0].astype(jnp.int32)
+        thickness = thickness_m(detector, number, wall, layer[1])
+        length_m = thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air
+        return _counts(detector, number, length_m, 0.5, layer[3])
 
-        return jax.lax.map(behind, jnp.asarray([(walls[0], 0.0, 0.0, 0.0), *layers], jnp.float32))
+    layers = jnp.asarray(shields(detector), jnp.float32)
+    direct, bins = jax.vmap(lambda k: jax.vmap(lambda layer: behind(k, layer))(layers))(jnp.arange(n))
+    total = jnp.maximum(jnp.sum(direct, axis=-1) + jnp.sum(bins, axis=-1), 1e-30)[..., None]
+    direct, bins = direct / total, bins / total
+    size = detector.peak_orders.shape[2:]
+    peaks = detector.peak_orders.reshape(*direct.shape[::2], -1)
+    scattered = bins.reshape(n * len(layers), -1) @ detector.bin_orders.reshape(bins.shape[-1], -1)
+    unscattered = jnp.einsum("nsl,nlx->nsx", direct, peaks).reshape(scattered.shape)
 
-    slope = TILT * tilt(detector.energy_kev)
-    background = detector.background_spectrum * jnp.stack([1.0 - slope, 1.0 + slope])
-    nuclides = jax.lax.map(of_nuclide, jnp.arange(len(detector.nuclide_names)))
-    return Templates(*map(_normalised, (background, nuclides, detector.grid_spectrum)))
+    return Tables(
+        background=detector.natural_orders,
+        sources=(unscattered + scattered).reshape(-1, *size),
+        scattered=scattered.reshape(-1, *size),
+        lines=detector.grid_spectrum,
+    )
 
 
-def tilt(energy_kev: jax.Array) -> jax.Array:
-    """A slope over energies [...]: linear in their logarithm, -1 at 30 keV, 1 at 3 MeV."""
-    low, high = np.log(_TILT_KEV)
-    return jnp.clip((2.0 * jnp.log(energy_kev) - low - high) / (high - low), -1.0, 1.0)
+def _counts(
+    detector: Detector, nuclide: jax.Array, length_m: jax.Array, place: jax.Array | float, above: jax.Array | float
+) -> tuple[jax.Array, jax.Array]:
+    """Counts of unscattered photons by line [L] and of scattered ones by bin, of a nuclide end on, up to one factor.
 
-
-def shielded(detector: Detector, nuclide: jax.Array, length_m: jax.Array, above: jax.Array) -> jax.Array:
-    """Spectrum [channels] of a nuclide end on behind ``length_m`` [M] of each material half way, up to a factor.
-
-    ``above`` [] is 1 for a source on the ground that is seen from above, 0 without a ground.
+    The way crosses ``length_m`` [M] of each material, whose middle is at ``place`` [] between source (0) and detector.
+    ``above`` [] is 1 where the ground shines as much as it can, 0 without a ground.
     """
-    shape = Shape(thin_m=length_m, spread=jnp.ones(()), closed=jnp.zeros(()), ground=jnp.stack([above, above]))
-    way = Crossed(length_m=length_m, place=jnp.full(len(detector.material_names), 0.5), shape=shape)
+    places, ground = jnp.full(len(detector.material_names), place), jnp.full(2, above)
+    shape = Shape(thin_m=length_m, spread=jnp.ones(()), closed=jnp.zeros(()), ground=ground)
+    way = Crossed(length_m=length_m, place=places, shape=shape)
     lines = _bare_lines(detector, nuclide)
     direct, scattered = transmission(detector, nuclide, way)
     of_ground = (lines * (direct + scattered) * from_ground(detector, nuclide, way)) @ detector.ground_bins[nuclide]
-    bins = (lines * scattered) @ scattered_shares(detector, nuclide, way) + of_ground
-    return (lines * direct) @ detector.peak_spectrum[nuclide] + bins @ detector.bin_spectrum
+    return lines * direct, (lines * scattered) @ scattered_shares(detector, nuclide, way) + of_ground
+
+
+def shielded(
+    detector: Detector,
+    nuclide: jax.Array,
+    length_m: jax.Array,
+    place: jax.Array | float = 0.5,
+    above: jax.Array | float = 0.0,
+) -> jax.Array:
+    """Spectrum [channels] of a nuclide end on behind ``length_m`` [M] of each material at ``place``, up to a factor.
+
+    ``above`` [] is 1 where the ground shines as much as it can, 0 without a ground.
+    """
+    direct, bins = _counts(detector, nuclide, length_m, place, above)
+    return direct @ detector.peak_spectrum[nuclide] + bins @ detector.bin_spectrum
 
 
 def thickness_m(detector: Detector, nuclide: jax.Array, material: jax.Array, depth: jax.Array) -> jax.Array:
@@ -104,37 +136,3 @@ def _bare_lines(detector: Detector, nuclide: jax.Array) -> jax.Array:
     """Counts [L] of each line without attenuation, end on, up to a factor."""
     end_on = direction_basis(jnp.float32(1.0), jnp.float32(0.0))
     return detector.yields[nuclide] * (detector.effective_area_m2[nuclide] @ end_on)
-
-
-def _normalised(spectra: jax.Array) -> jax.Array:
-    return spectra / jnp.maximum(jnp.sum(spectra, axis=-1, keepdims=True), 1e-30)
-
-
-def widened(detector: Detector, spectra: jax.Array, width: jax.Array) -> jax.Array:
-    """Spectra [..., channels] with the resolution's width times ``width`` []."""
-    first = detector.identification_bins[0]
-    variance = (detector.sigma_kev / (detector.energy_kev[1] - detector.energy_kev[0])) ** 2
-
-    def conduct(values: jax.Array) -> jax.Array:
-        flow = jnp.diff((variance * values)[..., first:], axis=-1)
-        # nothing flows over the threshold or the end
-        change = jnp.diff(jnp.pad(flow, [(0, 0)] * (flow.ndim - 1) + [(1, 1)]), axis=-1)
-        return jnp.pad(change, [(0, 0)] * (flow.ndim - 1) + [(first, 0)])
-
-    time = 0.5 * (width**2 - 1.0)
-    once = conduct(spectra)
-    return jnp.maximum(spectra + time * once + 0.5 * time**2 * conduct(once), 0.0)
-
-
-def rebinned(detector: Detector, spectra: jax.Array, gain: jax.Array, edges: np.ndarray) -> jax.Array:
-    """Counts [..., bins] of spectra [..., channels] between ``edges`` [bins + 1] (channels) at a gain [].
-
-    Below the threshold, where the tables hold nothing, they go on as in the first channel above it.
-    """
-    first = detector.identification_bins[0]
-    filled = jnp.where(jnp.arange(spectra.shape[-1]) < first, spectra[..., first : first + 1], spectra)
-    below = jnp.pad(jnp.cumsum(filled, axis=-1), [(0, 0)] * (spectra.ndim - 1) + [(1, 0)])
-    place = jnp.clip(edges / gain, 0.0, spectra.shape[-1])
-    left = jnp.minimum(place.astype(jnp.int32), spectra.shape[-1] - 1)
-    at_edges = below[..., left] + (place - left) * filled[..., left]
-    return jnp.diff(at_edges, axis=-1)
