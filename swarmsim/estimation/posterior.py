@@ -39,6 +39,7 @@ LEAST_EFFECTIVE = 16.0  # weights are flattened until they count as this many wh
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
 LEAST_ROUNDS = 4
 LEAST_STD_M = 1e-3
+OTHER_EACH = 4  # every fourth place of the first round may lie about a second mode
 NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 1  # Gauss-Newton steps at a place
 
@@ -83,12 +84,19 @@ class _Rounds:
 
 
 def sample_posterior(
-    weigh: Callable[[jax.Array], Weighed], start: jax.Array, covariance: jax.Array, rounds: int, per_round: int
+    weigh: Callable[[jax.Array], Weighed],
+    start: jax.Array,
+    covariance: jax.Array,
+    rounds: int,
+    per_round: int,
+    other: jax.Array | None = None,
 ) -> Posterior:
     """Moments of the posterior around ``start`` [3], whose covariance near it is about ``covariance`` [3, 3].
 
-    ``weigh`` gives the posterior at a place [3]. There are ``rounds`` of ``per_round`` places at most.
+    ``weigh`` gives the posterior at a place [3]. There are ``rounds`` of ``per_round`` places at most. A part of the
+    first ones lie about ``other`` [3], where there may be a second mode.
     """
+    starts = start if other is None else jnp.where(jnp.arange(per_round)[:, None] % OTHER_EACH == 0, other, start)
     even = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(_EVEN), 1.0)
     normal = jax.scipy.special.ndtri(jnp.clip(even, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
     scales = _scales(per_round)
@@ -115,7 +123,7 @@ def sample_posterior(
         likely = _drawn_evenly(done.known.place.reshape(-1, 3), weight.reshape(-1), per_round)
         wide = jnp.arange(per_round)[:, None] % len(SCALES) < ABOUT_MEAN
         first = done.count == 0
-        centres = jnp.where(first, start, jnp.where(wide, mean, likely))
+        centres = jnp.where(first, starts, jnp.where(wide, mean, likely))
         return centres, jnp.where(first, (FIRST_SPREAD / SCALES[1]) ** 2 * covariance, about)
 
     def round_(done: _Rounds) -> _Rounds:
@@ -281,7 +289,26 @@ def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_ro
     known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
     known = known.at[2].set(height_precision(problem.height_std_m))
     covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
-    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round)
+    other = mirrored_place(problem, s.place[k], jnp.sum(state.added.counts[k], axis=1))
+    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, other)
+
+
+def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax.Array:
+    """The place [3] on the other side of the way from which most of a source's ``counts`` [n] came.
+
+    A vehicle that drives straight past a source does not know on which side of it that lies. The way is the line that
+    fits the windows' places best, weighted with the counts.
+    """
+    m = problem.measurements
+    weight = jnp.where(m.valid, counts, 0.0)
+    weight = weight / jnp.maximum(jnp.sum(weight), 1e-9)
+    offset = jnp.where(m.valid[:, None], m.position_m[:, :2] - place[:2], 0.0)
+    middle = weight @ offset
+    apart = jnp.where(m.valid[:, None], offset - middle, 0.0)
+    xx, yy, xy = (weight @ (apart[:, i] * apart[:, j]) for i, j in ((0, 0), (1, 1), (0, 1)))
+    angle = 0.5 * jnp.arctan2(2.0 * xy, xx - yy)
+    across = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
+    return place.at[:2].add(2.0 * jnp.dot(middle, across) * across)
 
 
 def goodness(problem: Problem, state: State) -> Goodness:

@@ -159,7 +159,7 @@ def find_sources(
         wide = p.wide & jnp.any(again) & ~adding
         p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
         untried = done & ~p.trial & (jnp.sum(present) >= 2)
-        p = _ended_trial(params, p, done & p.trial)
+        p = _ended_trial(_further(problem, params), p, done & p.trial)
         p = _begun_trial(problem, params, p, untried)
         full = jnp.all(p.state.sources.present) & ~jnp.any(p.again)
         return replace(p, over=p.over | full | (p.left <= 0))
@@ -180,15 +180,21 @@ def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.
         ratio = jnp.where(s.present, ratios(problem, p.state), jnp.inf)
         k = jnp.argmin(ratio)
         less = replace(p, state=settled(problem, without(p.state, k)), before=p.state)
-        less = replace(less, trial=ratio[k] >= params.threshold, again=less.state.sources.present)
-        return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * params.threshold), less, p)
+        least = _further(problem, params)
+        less = replace(less, trial=ratio[k] >= least, again=less.state.sources.present)
+        return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * least), less, p)
 
     return either(now, begin, lambda: p)
 
 
-def _ended_trial(params: SearchParams, p: _Progress, now: jax.Array) -> _Progress:
-    """``now``: the sources before the trial, unless those left explain the counts as well."""
-    needless = 2.0 * (p.before.likelihood - p.state.likelihood) < params.threshold
+def _further(problem: Problem, params: SearchParams) -> jax.Array:
+    """Statistic [] that a source beside others must reach: errors of the model of those look like further sources."""
+    return params.threshold / problem.learning_rate
+
+
+def _ended_trial(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
+    """``now``: the sources before the trial, unless those left explain the counts as well, within ``least`` []."""
+    needless = 2.0 * (p.before.likelihood - p.state.likelihood) < least
     kept = jax.tree.map(partial(jnp.where, now & ~needless), p.before, p.state)
     return replace(p, state=kept, trial=p.trial & ~now)
 
@@ -218,7 +224,7 @@ def _sought(
     def look() -> tuple[State, jax.Array]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
-        found = ~adding | (ratio > params.threshold)
+        found = ~adding | (ratio > jnp.where(jnp.any(s.present), _further(problem, params), params.threshold))
         after = _with(problem, state, slot, best)
         kept = jnp.where(adding | wide, values, s.nuclide_value[slot])
         table = after.sources.nuclide_value.at[slot].set(kept)

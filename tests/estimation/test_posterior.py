@@ -13,10 +13,10 @@ from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.posterior import WEIGH_STEPS, Weighed, posteriors, sample_posterior
+from swarmsim.estimation.posterior import WEIGH_STEPS, Weighed, mirrored_place, posteriors, sample_posterior
 from swarmsim.estimation.search import attempt
 from swarmsim.estimation.sources import Sources, no_sources
-from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey
+from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
 
 AT, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
 WALLS = [((9.5, 4.0, 1.5), (0.05, 4.0, 1.5), "concrete"), ((12.0, 6.2, 1.5), (2.5, 0.05, 1.5), "concrete")]
@@ -164,3 +164,24 @@ def test_without_any_measurement_the_moments_are_finite():
     nothing = replace(problem, measurements=replace(m, valid=jnp.zeros_like(m.valid)))
     found = _sample(nothing, state)
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(found))
+
+
+def test_a_straight_way_does_not_tell_its_sides_apart():
+    """A rover drives past a source on level ground: both sides of its way are as likely."""
+    site = place([])
+    along = np.arange(-20.0, 20.0)
+    drive = windows(np.stack([along, 0.2 * along, np.full(40, 0.6)], axis=-1))
+    source = np.array([1.0, 4.0, 1.0])
+    certain = Knowledge(site="exact", background_std=0.05, model_std=0.01, learning_rate=1.0)
+    known = presumed(site, (detector(),), knowledge=certain, height_std_m=1e-3)
+    problem = problem_of(known, drawn_of_one(site, detector(), drive, source, ACTIVITY, 0), ((0, 40, 0, 1),))
+    state = _state(problem, jnp.asarray(source, jnp.float32))
+    normal = np.array([-0.2, 1.0]) / np.hypot(0.2, 1.0)
+    side = float(source[:2] @ normal)
+    other = mirrored_place(problem, jnp.asarray(source, jnp.float32), jnp.sum(state.added.counts[0], axis=1))
+    np.testing.assert_allclose(other, [*(source[:2] - 2.0 * side * normal), 1.0], atol=0.05)
+    found = _sample(problem, state)
+    assert abs(float(np.asarray(found.mean)[:2] @ normal)) < 0.5 * side  # a quarter and three quarters at most
+    across = float(normal @ np.asarray(found.covariance)[:2, :2] @ normal)
+    assert np.sqrt(across) == pytest.approx(side, rel=0.15)
+    assert float(found.effective) > 16.0
