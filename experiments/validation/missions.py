@@ -5,7 +5,7 @@
 
 Writes ``sources.csv`` (a row for each true source and each false one), ``summary.json`` and ``errors.png``. A true
 source counts as found by the estimate next to it, up to 25 m away. It is detectable where the same likelihood, with all
-sources at their true places, misses it by more than the mission's threshold.
+sources at their true places, misses it by more than the mission asks of a source (of one beside others it asks more).
 """
 
 import argparse
@@ -49,7 +49,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     batch = simulation.rollout(seeds)
     detectable = _detectable(simulation, batch)
     records = [swarmsim.mission_record(simulation, batch, i) for i in range(options.missions)]
-    rows = [row for record, seen in zip(records, detectable, strict=True) for row in rows_of(record, seen)]
+    mission = simulation.scenario.mission
+    assert mission.localisation is not None
+    least = mission.localisation.detection_sigma**2
+    asked = (least, least / mission.knowledge.learning_rate)
+    rows = [row for record, seen in zip(records, detectable, strict=True) for row in rows_of(record, seen, asked)]
     summary = summarised(records, rows) | {"clock_s": {name: round(s, 2) for name, s in batch.clock.ran.items()}}
     options.out.mkdir(parents=True, exist_ok=True)
     with (options.out / "sources.csv").open("w", newline="") as file:
@@ -92,9 +96,14 @@ def _detectable(simulation: Any, batch: Any) -> list[np.ndarray]:
     return found
 
 
-def rows_of(record: MissionRecord, ratio: np.ndarray) -> list[dict[str, Any]]:
-    """A row for each true source of a mission, and for each false one."""
+def rows_of(record: MissionRecord, ratio: np.ndarray, asked: tuple[float, float]) -> list[dict[str, Any]]:
+    """A row for each true source of a mission, and for each false one.
+
+    ``ratio`` is twice the logarithm of the likelihood ratio of each true source, ``asked`` what the mission asks of one
+    that is alone and of one beside others.
+    """
     active = record.sources
+    least = asked[len(active) > 1]
     seen = [float(r) for r in ratio if r != 0.0][: len(active)] + [0.0] * len(active)
     matched = matches(active, record.estimates)
     rows = []
@@ -102,12 +111,12 @@ def rows_of(record: MissionRecord, ratio: np.ndarray) -> list[dict[str, Any]]:
         places = [np.linalg.norm(source.position_m[:2] - o.position_m[:2]) for o in active if o is not source]
         row = {"seed": record.seed, "status": record.status, "true": source.nuclide, "mbq": source.activity_mbq,
                "region": record.drawn.get(f"sources.{number}.region"), "apart_m": min(places, default=np.inf),
-               "true_ratio": seen[number], "found": None}  # fmt: skip
+               "true_ratio": seen[number], "detectable": seen[number] > least, "found": None}  # fmt: skip
         rows.append(row | _judged(matched.get(number), source))
     for k, estimate in enumerate(record.estimates):
         if k not in {id_ for id_, _ in matched.values()}:
             row = {"seed": record.seed, "status": record.status, "true": None, "mbq": 0.0, "region": None,
-                   "apart_m": None, "true_ratio": None}  # fmt: skip
+                   "apart_m": None, "true_ratio": None, "detectable": None}  # fmt: skip
             rows.append(row | _judged((k, estimate), None))
     return rows
 
@@ -155,7 +164,7 @@ def summarised(records: Sequence[MissionRecord], rows: Sequence[dict[str, Any]])
     resolved, right, sure = 0, 0, 0
     for record in records:
         own = [r for r in rows if r["seed"] == record.seed and r["true"] is not None]
-        if own and all(r["true_ratio"] > 30.25 for r in own) and all(r["apart_m"] >= RESOLVED_M for r in own):
+        if own and all(r["detectable"] for r in own) and all(r["apart_m"] >= RESOLVED_M for r in own):
             resolved += 1
             right += len(record.estimates) == len(own)
             sure += record.status == "located"
