@@ -93,8 +93,9 @@ def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
     assert np.all((bound > 0.4) & (bound < 1.0))  # tens of centimetres from 20 m above: not a bound that says nothing
     error = fits.position_m[:, :2] - np.asarray(source.position_m)[:2]
     rmse = np.sqrt(np.mean(error**2, axis=0))
-    assert np.all(rmse <= 1.3 * bound)
-    # the bound is that of total counts of a known background: energies tell more, an unknown background less
+    # the bound is that of total counts of a known background: energies tell more, an unknown background less, all the
+    # more of photons that the ground scatters, whose spectrum is like its own
+    assert np.all(rmse <= 2.0 * bound)
     assert np.all(rmse >= 0.6 * bound)
     assert np.all(np.abs(error.mean(axis=0)) < 4.0 * bound / np.sqrt(SEEDS))
     assert np.all(fits.present)
