@@ -65,9 +65,9 @@ def crossed(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
 
     Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
     The terrain is crossed exactly too (`swarmsim.site.terrain_crossing`). Lengths are continuous in both ends and
-    differentiable almost everywhere; of the rest only ``thin_m`` is, the others are constants to derivatives. Where
-    obstacles overlap, the lengths are scaled so that their sum does not exceed the distance. The remaining distance is
-    that through ``air`` if the table has it, and then the sum equals the distance.
+    differentiable almost everywhere; of the rest ``thin_m`` and ``ground`` are, the others are constants to
+    derivatives. Where obstacles overlap, the lengths are scaled so that their sum does not exceed the distance. The
+    remaining distance is that through ``air`` if the table has it, and then the sum equals the distance.
     """
     return _crossed(site, above_of(site), a, b)
 
@@ -97,9 +97,8 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Bo
         rest = jnp.where(materials == site.material_names.index("air"), jnp.maximum(1.0 - total, 0.0), 0.0)
         fractions, thin = fractions + rest, thin + rest
     spread, closed = 1.0 - jnp.sum(found.narrow) / walls, jnp.sum(found.closed) / walls
-    constant = (jnp.clip(place, 0.0, 1.0), spread, closed, mirrored(site, a, b))
-    place, spread, closed, shines = jax.lax.stop_gradient(constant)
-    shape = Shape(thin_m=distance * thin, spread=spread, closed=closed, ground=shines)
+    place, spread, closed = jax.lax.stop_gradient((jnp.clip(place, 0.0, 1.0), spread, closed))
+    shape = Shape(thin_m=distance * thin, spread=spread, closed=closed, ground=mirrored(site, a, b))
     return Crossed(length_m=distance * fractions, place=place, shape=shape)
 
 
@@ -113,7 +112,9 @@ def mirrored(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
     level2 = jnp.square(b[0] - a[0]) + jnp.square(b[1] - a[1])
     both, image2 = one + other, level2 + jnp.square(one + other) + 1e-12
     u, ratio = both * jax.lax.rsqrt(image2), (level2 + jnp.square(one - other)) / image2
-    return ratio * jnp.stack([jnp.sqrt(u), u])
+    # an elevation of zero has a root without derivative
+    root = jnp.where(u > 0.0, jnp.sqrt(jnp.where(u > 0.0, u, 1.0)), 0.0)
+    return ratio * jnp.stack([root, u])
 
 
 def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
