@@ -5,9 +5,8 @@
 writes ``enclosures.csv`` and prints the table of the README.
 """
 
-import csv
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from experiments.transport.bodies import Boxes, seen
 from experiments.transport.compare import ENERGIES_KEV, FAINT, detector_of, efficiency
 from experiments.transport.sites import Block, modelled, site_of, ways
+from experiments.transport.tables import write_table
 from experiments.transport.walk import Floats, Medium, medium
 from swarmsim.radiation import load_library
 
@@ -227,11 +227,7 @@ def main(
     for energy in BOXED_KEV:
         found += list(runs.of_energy(energy))
         print(f"{energy:g} keV", flush=True)
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "enclosures.csv").open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(Case.__dataclass_fields__)
-        writer.writerows([f"{v:.4g}" if isinstance(v, float) else v for v in astuple(c)] for c in found)
+    write_table(out / "enclosures.csv", found)
     print(told(found))
 
 

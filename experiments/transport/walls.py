@@ -6,9 +6,8 @@ writes ``walls.csv``, prints how far the model is from the Monte Carlo, and the 
 ``configs/elements/walls.csv``. Twenty minutes on one core.
 """
 
-import csv
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -23,6 +22,7 @@ from scipy.optimize import least_squares
 from experiments.transport.bodies import Boxes, seen
 from experiments.transport.compare import ENERGIES_KEV, FAINT, detector_of, efficiency
 from experiments.transport.sites import Block, modelled, site_of, ways
+from experiments.transport.tables import write_table
 from experiments.transport.walk import Floats, Medium, medium
 from swarmsim.radiation import Detector, load_library
 from swarmsim.radiation.walls import Constants, constants, scattered_counts
@@ -211,11 +211,7 @@ def main(
     for own, way in cases(detector, seeds, photons):
         found += own
         parts.append(way)
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / "walls.csv").open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(Case.__dataclass_fields__)
-        writer.writerows([f"{v:.4g}" if isinstance(v, float) else v for v in astuple(c)] for c in found)
+    write_table(out / "walls.csv", found)
     print(told(found))
     last = max(c.seed for c in found)
     print("Those that were not fitted to:\n" + told([c for c in found if c.seed == last]))

@@ -1,21 +1,13 @@
 """The commands: thin, and quick to start. What they need is imported when they run."""
 
-import atexit
-import gc
-import os
-import sys
-from collections.abc import Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, Parameter
 from cyclopts.validators import Number
 
-from swarmsim.config.errors import InputError
-
-EXIT_INPUT, EXIT_INTERRUPTED = 2, 130
 SEED_END = 2**31
 
 Kind = Literal["vehicles", "sites", "missions", "detectors", "nuclides", "materials", "policies"]
@@ -43,7 +35,8 @@ app = App(
         "    swarmsim init my_project     copy the configurations out, to edit them\n"
         "    swarmsim list vehicles       what there is to build a team of\n\n"
         "'swarmsim COMMAND --help' says more of a command, with examples.\n"
-        "Exit codes: 0 done, 2 wrong input (told on standard error), 130 stopped with Ctrl-C."
+        "Exit codes: 0 done, 2 wrong input (told on standard error), 3 a doubtful answer of 'run --strict',\n"
+        "130 stopped with Ctrl-C."
     ),
     version=_version,
     help_format="plaintext",
@@ -368,43 +361,3 @@ def export_n42(
     from swarmsim.cli.export import export_run
 
     export_run(run, out, vehicles, start, force)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line ``arguments`` (those of the process when None); the exit code.
-
-    Wrong input is told on standard error without a traceback; an error of swarmsim itself keeps its traceback.
-    """
-    atexit.register(gc.freeze)  # the interpreter's last collection of garbage would take another second
-    try:
-        os.getcwd()
-    except OSError as error:
-        sys.stderr.write(f"the working folder cannot be used ({error.strerror}): change to another one\n")
-        return EXIT_INPUT
-    try:
-        code = app(
-            sys.argv[1:] if arguments is None else list(arguments),
-            exit_on_error=False,
-            print_error=False,
-            result_action="return_value",
-        )
-        return code if isinstance(code, int) else 0
-    except CycloptsError as error:
-        sys.stderr.write(f"{error}\n\nSee 'swarmsim --help' and 'swarmsim COMMAND --help'.\n")
-        return EXIT_INPUT
-    except InputError as error:
-        sys.stderr.write(f"{describe(error)}\n")
-        return EXIT_INPUT
-    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except KeyboardInterrupt:
-        sys.stderr.write("\nstopped with Ctrl-C: nothing unfinished was left behind\n")
-        return EXIT_INTERRUPTED
-    return 0
-
-
-def describe(error: InputError) -> str:
-    """All problems of an `InputError` as text."""
-    count = len(error.problems)
-    heading = "" if count == 1 else f"{count} problems\n\n"
-    return heading + "\n\n".join(str(problem) for problem in error.problems)

@@ -18,9 +18,7 @@ class Emission:
 
     decay_1_s: jax.Array  # [P] decay constant
     number: jax.Array  # [P] int32: source of the mission that a point belongs to
-    carrier: (
-        jax.Array | None
-    )  # [C] int32: vehicles that carry points, as rows of all groups after one another; None: none is carried
+    carrier: jax.Array | None  # [C] int32: their vehicles, as rows of all groups after one another; None: no carrier
     corners_m: jax.Array | None  # [K, 3] corners of all lines and areas, world; None: there are none
     corner_of: jax.Array | None  # [K] int32: source of the mission that a corner belongs to
 

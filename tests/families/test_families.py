@@ -341,6 +341,15 @@ def test_a_source_drawn_into_a_wall_is_told_with_its_seed():
         swarmsim.build(swarmsim.load("recon", inside))
 
 
+def test_only_sources_that_a_family_draws_are_checked_against_the_site():
+    placed = "vary.sources.*.position_m={place: {region: open, apart_m: 20}}"
+    in_a_wall = "{nuclide: Co-60, position_m: [4.8, 4.0], height_m: 1, activity_mbq: 50}"
+    own = [f"sources=[{in_a_wall}]", "vary.sources={count: [1, 3]}", placed, "engine=analytic"]
+    built = swarmsim.build(swarmsim.load("recon", own))
+    counts = {int(np.sum(np.asarray(built.world_of(seed).sources.activity_bq) > 0.0)) for seed in range(12)}
+    assert counts == {1, 2, 3}
+
+
 def test_a_path_of_its_own_comes_before_a_wildcard():
     settings = ["engine=analytic", "vary.sources.1.activity_mbq={choice: [7.0]}"]
     draws = swarmsim.build(swarmsim.load("random_recon", settings)).draw(SEEDS)

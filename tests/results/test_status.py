@@ -81,6 +81,11 @@ def test_each_doubt_has_its_status_and_sentence(given, status: str, said: str) -
     assert any(re.search(said, reason) for reason in found.reasons)
 
 
+def test_a_counter_is_saturated_short_of_its_highest_rate() -> None:
+    assert verdict(samples=survey(rate=0.7 * 184e3)).status == "located"
+    assert verdict(samples=survey(rate=0.8 * 184e3)).status == "saturated"
+
+
 def test_a_source_that_the_survey_did_not_show_is_compared_with_none() -> None:
     assert verdict(aerial=(estimate(30.0, std=0.5, nuclide="Cs-137"),)).status == "located"
 

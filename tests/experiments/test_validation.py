@@ -1,0 +1,83 @@
+"""Validation of missions: which estimate stands for which source, and what is counted of them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from experiments.validation.missions import matches, rows_of, summarised
+
+ASKED = (30.0, 60.0)
+
+
+def source(x, y=0.0, nuclide="Co-60", activity=100.0):
+    return SimpleNamespace(position_m=np.array([x, y, 0.5]), nuclide=nuclide, activity_mbq=activity)
+
+
+def estimate(x, y=0.0, nuclide="Co-60", activity=100.0, std=0.5):
+    return SimpleNamespace(
+        position_m=np.array([x, y, 0.5]), covariance_m2=np.diag([std**2, std**2, 0.04]), activity_mbq=activity,
+        activity_std_mbq=0.1 * activity, nuclide=nuclide, detection=90.0, effective_samples=80.0, converged=True,
+    )  # fmt: skip
+
+
+def record(sources, estimates, status="located", seed=0):
+    drawn = {f"sources.{i}.region": "open" for i in range(len(sources))}
+    return SimpleNamespace(
+        seed=seed, status=status, sources=tuple(sources), estimates=tuple(estimates), drawn=drawn, site="yard"
+    )
+
+
+def test_nearest_pairs_come_first_and_none_is_used_twice():
+    sources, estimates = [source(0.0), source(30.0)], [estimate(24.0), estimate(1.0), estimate(90.0)]
+    found = matches(sources, estimates)
+    assert {i: k for i, (k, _) in found.items()} == {0: 1, 1: 0}
+    assert matches([source(0.0)], [estimate(25.1)]) == {}
+    assert {i: k for i, (k, _) in matches([source(0.0), source(4.0)], [estimate(3.0)]).items()} == {1: 0}
+
+
+def test_errors_are_in_standard_deviations_of_what_was_stated():
+    row = rows_of(record([source(0.0)], [estimate(1.0, activity=110.0)]), np.array([80.0]), ASKED)[0]
+    assert (row["error_m"], row["sigmas"]) == (pytest.approx(1.0), pytest.approx(2.0))
+    assert row["activity_sigmas"] == pytest.approx(np.log(1.1) / 0.1)
+    assert (row["apart_m"], row["detectable"], row["found"]) == (np.inf, True, "Co-60")
+
+
+def test_a_source_beside_others_must_be_seen_better():
+    ratios = np.array([40.0, 40.0])
+    both = rows_of(record([source(0.0), source(40.0)], []), ratios, ASKED)
+    assert [row["detectable"] for row in both] == [False, False]
+    assert [row["detectable"] for row in rows_of(record([source(0.0)], []), ratios[:1], ASKED)] == [True]
+    assert both[0]["apart_m"] == pytest.approx(40.0)
+    assert both[0]["found"] is None
+
+
+def test_false_sources_have_a_row_of_their_own():
+    rows = rows_of(record([source(0.0)], [estimate(0.2), estimate(60.0, nuclide="Cs-137")]), np.array([80.0]), ASKED)
+    assert [row["true"] for row in rows] == ["Co-60", None]
+    assert (rows[1]["found"], rows[1]["sigmas"]) == ("Cs-137", None)
+
+
+def test_shares_are_of_those_that_they_speak_of():
+    missions = [
+        record([source(0.0)], [estimate(0.5)], seed=0),
+        record([source(0.0)], [estimate(4.0)], seed=1),
+        record([source(0.0)], [estimate(1.5, nuclide="Cs-137"), estimate(50.0)], "ambiguous", seed=2),
+        record([source(0.0), source(12.0)], [estimate(0.0)], "located", seed=3),
+        record([source(0.0)], [], "none", seed=4),
+        record([], [estimate(9.0)], "located", seed=5),
+    ]
+    seen = [[80.0], [80.0], [80.0], [80.0, 80.0], [12.0], []]
+    rows = [row for r, ratio in zip(missions, seen, strict=True) for row in rows_of(r, np.array(ratio), ASKED)]
+    told = summarised(missions, rows)
+    assert told["statuses"] == {"located": 4, "ambiguous": 1, "none": 1}
+    assert (told["true"], told["found"], told["false"], told["false_located"]) == (6, 4, 2, 1)
+    assert told["located_sources"] == 3
+    assert told["located_inside_95"] == pytest.approx(2 / 3)
+    assert told["located_beyond_5_sigma"] == pytest.approx(1 / 3)
+    assert told["all_inside_95"] == pytest.approx(2 / 4)  # errors of 1, 8, 3 and 0 standard deviations
+    assert told["nuclide_right"] == pytest.approx(3 / 4)
+    # seeds 0 to 2: the two of seed 3 are too near each other, the one of seed 4 is too faint
+    assert told["detectable_and_resolved"] == 3
+    assert told["of_those_number_right"] == pytest.approx(2 / 3)
+    assert told["of_those_located"] == pytest.approx(2 / 3)
