@@ -36,6 +36,7 @@ MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count f
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
 LOOSE = 1e-4  # precision of what has no prior
+FLAT = 1e-6  # 1/m^2, precision of a place that no count tells of
 
 
 @pytree
@@ -59,6 +60,7 @@ class Settled:
     unknowns: Unknowns
     covariance: jax.Array  # [P, P] of ln(activity), the others' factors, levels and lengths, the place held
     towards: jax.Array  # [3, 3] information about the place, the unknowns marginalised; as if nothing were in the way
+    move: jax.Array  # [3] Gauss-Newton step of the place; as if nothing were in the way
     rates: Rates  # of the source, with the lengths of the fit
 
 
@@ -174,6 +176,7 @@ class NormalEquations:
     crossing: jax.Array  # [n, 2, P]
     own_push: jax.Array  # [n, 2]
     towards: jax.Array  # [3, 3]
+    pull: jax.Array  # [3] derivative by the place, the unknowns marginalised
     log_volume: jax.Array  # [] of the windows' own unknowns, over that of their priors
     fitted: jax.Array  # [] how many of them the data determine
 
@@ -204,14 +207,16 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
     p = common_precision.shape[0]
     information = whole[:p, :p] + jnp.diag(common_precision)
     across = whole[:p, p:]
+    common_push = push[:p] - common_precision * _common(u)
     inverse = scaled_inverse(information)
     return NormalEquations(
         information=information,
-        push=push[:p] - common_precision * _common(u),
+        push=common_push,
         own=own,
         crossing=crossing[:, :, :p],
         own_push=own_push,
         towards=whole[p:, p:] - across.T @ inverse @ across,
+        pull=push[p:] - across.T @ inverse @ common_push,
         log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(determinant * jnp.prod(model.variance, axis=1)), 0.0)),
         fitted=jnp.sum(jnp.where(m.valid, 2.0 - jnp.einsum("naa,na->n", own, own_precision), 0.0)),
     )
@@ -301,8 +306,9 @@ def settle(
 def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, source: Rates) -> Settled:
     at = normal_equations(problem, model, u)
     height = ways.position_m[2] - sample(problem.site.terrain_m, problem.site, ways.position_m[:2])
-    of_height = height_precision(problem.height_std_m) * jnp.square(height - problem.height_m)
-    likelihood = log_likelihood(problem, model) + log_prior(problem, model, u) - 0.5 * of_height
+    precise, above = height_precision(problem.height_std_m), height - problem.height_m
+    likelihood = log_likelihood(problem, model) + log_prior(problem, model, u) - 0.5 * precise * jnp.square(above)
+    towards, pull = at.towards.at[2, 2].add(precise), at.pull.at[2].add(-precise * above)
     scale = jnp.sqrt(jnp.maximum(jnp.diagonal(at.information), 1e-20))
     unit = at.information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
     root = jax.scipy.linalg.cholesky(unit, lower=True)
@@ -316,6 +322,7 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
         unknowns=u,
         covariance=scaled_inverse(at.information),
         towards=at.towards,
+        move=scaled_inverse(towards + jnp.eye(3) * FLAT) @ pull,
         rates=source,
     )
 

@@ -25,7 +25,7 @@ from swarmsim.device import each, either
 from swarmsim.estimation.fit import MEAN_FLOOR, alone, normal_equations, settle
 from swarmsim.estimation.forward import Problem, ways_from
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
-from swarmsim.estimation.search import TOGETHER, bounds
+from swarmsim.estimation.search import TOGETHER, attempt, bounds
 from swarmsim.estimation.sources import ALONE_STEPS, State, without
 from swarmsim.pytree import pytree
 
@@ -40,6 +40,8 @@ ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
 LEAST_ROUNDS = 4
 LEAST_STD_M = 1e-3
 OTHER_EACH = 4  # every fourth place of the first round may lie about a second mode
+MOVES = 3  # Gauss-Newton steps of the place towards that mode
+LONGEST_MOVE_M = 1.0
 NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 1  # Gauss-Newton steps at a place
 
@@ -290,6 +292,12 @@ def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_ro
     known = known.at[2].set(height_precision(problem.height_std_m))
     covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
     other = mirrored_place(problem, s.place[k], jnp.sum(state.added.counts[k], axis=1))
+
+    def nearer(_: int, place: jax.Array) -> jax.Array:
+        step = attempt(problem, nuclide, others, u, place).fit.move
+        return place + jnp.clip(jnp.nan_to_num(step), -LONGEST_MOVE_M, LONGEST_MOVE_M)
+
+    other = jax.lax.fori_loop(0, MOVES, nearer, other)
     return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, other)
 
 
@@ -297,10 +305,10 @@ def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax
     """The place [3] on the other side of the way from which most of a source's ``counts`` [n] came.
 
     A vehicle that drives straight past a source does not know on which side of it that lies. The way is the line that
-    fits the windows' places best, weighted with the counts.
+    fits the windows' places best, weighted with the squares of the counts, so that it is the part next to the source.
     """
     m = problem.measurements
-    weight = jnp.where(m.valid, counts, 0.0)
+    weight = jnp.square(jnp.where(m.valid, counts / jnp.maximum(jnp.max(counts), 1e-9), 0.0))
     weight = weight / jnp.maximum(jnp.sum(weight), 1e-9)
     offset = jnp.where(m.valid[:, None], m.position_m[:, :2] - place[:2], 0.0)
     middle = weight @ offset

@@ -21,7 +21,7 @@ from swarmsim.estimation.fit import (
     settle,
 )
 from swarmsim.estimation.forward import Problem, Rates, rates, ways_from, with_one_ray
-from swarmsim.estimation.likelihood import height_precision
+from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.pytree import pytree
 
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
@@ -29,6 +29,7 @@ GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
 FITTED = 4  # of the candidates of a round: the best of each part
 STEPS = 3  # Gauss-Newton steps at a place
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
+FARTHEST = 6.0  # standard deviations of a place within which others are looked for along its uncertainty
 TOGETHER = 24  # places that an accelerator looks at side by side
 
 Bounds = tuple[jax.Array, jax.Array]  # lower and upper [3]
@@ -110,12 +111,30 @@ def spread(centre: jax.Array, reach_m: jax.Array, up_m: jax.Array, count: int, t
 
     A third of them is up to three times as far; ``turn`` [] turns the pattern.
     """
+    return centre + _pattern(count, turn) * jnp.stack([reach_m, reach_m, up_m])
+
+
+def spread_along(problem: Problem, best: Tried, reach_m: jax.Array, count: int, turn: jax.Array) -> jax.Array:
+    """Places [count, 3] about ``best``, as far in each direction as its place is uncertain, ``reach_m`` at most.
+
+    Close to a strong source the posterior is a ridge, centimetres wide and a metre long, which places all around would
+    miss. The first of them is where the Gauss-Newton step of the place leads.
+    """
+    covariance = scaled_inverse(best.fit.towards.at[2, 2].add(height_precision(problem.height_std_m)))
+    widest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(covariance)), 1e-12))
+    shape = covariance / jnp.square(widest) + 1e-4 * jnp.eye(3)
+    root = jnp.minimum(reach_m, FARTHEST * widest) * jnp.linalg.cholesky(shape)
+    step = jnp.clip(jnp.nan_to_num(best.fit.move), -reach_m, reach_m)
+    return best.place + (_pattern(count, turn) @ root.T).at[0].set(step)
+
+
+def _pattern(count: int, turn: jax.Array) -> jax.Array:
+    """Offsets [count, 3] in a cylinder of radius and half height 1, a third of them up to three times as far out."""
     index = jnp.arange(count)
     share = jnp.sqrt((index + 0.5) / count) * jnp.where(index % 3 == 2, 3.0, 1.0)
     angle = GOLDEN_ANGLE_RAD * (index + count * turn)
     height = 2.0 * jnp.mod((index + count * turn) * GOLDEN_RATIO, 1.0) - 1.0
-    offset = jnp.stack([reach_m * share * jnp.cos(angle), reach_m * share * jnp.sin(angle), up_m * height], axis=-1)
-    return centre + offset
+    return jnp.stack([share * jnp.cos(angle), share * jnp.sin(angle), height], axis=-1)
 
 
 def best_of(

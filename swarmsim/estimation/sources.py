@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.device import either, switch
-from swarmsim.estimation.fit import Others, Settled, Unknowns, nothing_known, without_more
+from swarmsim.estimation.fit import FLAT, Others, Settled, Unknowns, nothing_known, without_more
 from swarmsim.estimation.forward import Problem, Rates, rates, variance_of, ways_from
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.scan import scan, strongest
-from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread
+from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
 from swarmsim.pytree import pytree, static
 
 ALONE_STEPS = 4  # Gauss-Newton steps without a further source
@@ -219,7 +219,7 @@ def _sought(
         return Starts(point_m=points_m[index], nuclide=scanned.nuclide[index]), statistic[0]
 
     nothing = Starts(point_m=jnp.zeros((STARTS, 3)), nuclide=jnp.zeros(STARTS, jnp.int32))
-    starts, statistic = either(adding, first_look, lambda: (nothing, jnp.zeros(())))
+    starts, statistic = either(adding | wide, first_look, lambda: (nothing, jnp.zeros(())))
 
     def look() -> tuple[State, jax.Array]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
@@ -252,7 +252,8 @@ def _best(
     closing = CLOSING ** jnp.arange(1, params.rounds + 1)
     reaches = params.reach_m * jnp.concatenate([jnp.ones(BEGINNINGS), jnp.array(REACHES), closing])
     naming, closer = BEGINNINGS + 1, BEGINNINGS + len(REACHES)
-    first = jnp.where(adding, 0, jnp.where(wide, BEGINNINGS, closer))
+    first = jnp.where(adding | wide, 0, closer)
+    s = state.sources
     yes, no = jnp.ones(size, bool), jnp.zeros(size, bool)
     up_m = 1.5 * problem.height_std_m
 
@@ -261,7 +262,11 @@ def _best(
         centre = jnp.concatenate([starts.point_m[index, :2], jnp.broadcast_to(problem.height_m, (FITTED, 1))], axis=1)
         around = jax.vmap(lambda c: spread(c, AROUND * params.grid_m, up_m, size // FITTED, number))(centre)
         nuclides = jnp.repeat(starts.nuclide[index], size // FITTED)
-        return Candidates(place=around.reshape(-1, 3), nuclide=nuclides, allowed=yes, sure=no, apart=yes[0])
+        # where a source was found before is the first candidate
+        known_one = ~adding & (number == 0) & (jnp.arange(size) == 0)
+        places = jnp.where(known_one[:, None], s.place[slot], around.reshape(-1, 3))
+        nuclides = jnp.where(known_one, s.nuclide[slot], nuclides)
+        return Candidates(place=places, nuclide=nuclides, allowed=yes, sure=known_one, apart=yes[0])
 
     def name(best: Tried, number: jax.Array) -> Candidates:
         everyone = jnp.arange(size, dtype=jnp.int32)
@@ -271,11 +276,14 @@ def _best(
         return Candidates(place=places, nuclide=kinds, allowed=asked, sure=no, apart=no[0])
 
     def around(best: Tried, number: jax.Array) -> Candidates:
-        reach_m = reaches[number]
-        places = spread(best.place, reach_m, jnp.minimum(reach_m, up_m), size, number.astype(jnp.float32))
+        reach_m, index = reaches[number], jnp.arange(size)
+        turn = number.astype(jnp.float32)
+        part = size // FITTED
+        near = spread(best.place, reach_m, jnp.minimum(reach_m, up_m), size - part, turn)
+        places = jnp.concatenate([near, spread_along(problem, best, reach_m, part, turn)])
         # the best place so far is the first candidate: the tolerance is another now
-        sure = jnp.arange(size) == 0
-        places = jnp.where(sure[:, None], best.place, places)
+        sure = (index == 0) | (index == size - part)
+        places = jnp.where((index == 0)[:, None], best.place, places)
         return Candidates(
             place=places, nuclide=jnp.full(size, best.nuclide), allowed=yes, sure=sure, apart=yes[0]
         )  # fmt: skip
@@ -320,7 +328,8 @@ def _beginning(problem: Problem, state: State, slot: jax.Array, adding: jax.Arra
             likelihood=unknown,
             unknowns=replace(state.unknowns, activity_bq=jnp.where(adding, 0.0, activity)),
             covariance=jnp.eye(shared),
-            towards=jnp.eye(3),
+            towards=s.towards[slot] + FLAT * jnp.eye(3),
+            move=jnp.zeros(3),
             rates=Rates(
                 counts=jnp.where(adding, 0.0, state.added.counts[slot] / activity),
                 slopes=jnp.zeros((n, problem.material_std.shape[0], regions)),
