@@ -35,6 +35,9 @@ from swarmsim.site import sample
 MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count finite
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
+LEVEL_STEPS = 8  # of the activity that the windows' own ones are put together to
+FAR_OFF = 0.25  # over the standard deviations of its counts by which a window's rate must be off to start with a gain
+FARTHEST_GAIN = 5.0  # logarithm of a window's rate over the model's, where a fit starts
 LOOSE = 1e-4  # precision of what has no prior
 FLAT = 1e-6  # 1/m^2, precision of a place that no count tells of
 
@@ -280,14 +283,14 @@ def settle(
         others: other sources.
         start: where to begin.
         steps: of Gauss-Newton (static).
-        fresh: whether the activity is not known from ``start``: the first one is that which fits best if all else is
-            held (static).
+        fresh: whether the place is a new one: then the activity and the windows' own unknowns are not taken from
+            ``start`` (static).
         exact: whether the rates are computed again with the lengths that were fitted; else they are extrapolated
             (`lengthened`; static).
     """
     source = rates(problem, ways, nuclide, start.lengths)
     if fresh:
-        start = replace(start, activity_bq=_first_activity(problem, source, others, start))
+        start = _begun(problem, source, others, ways.position_m, start)
 
     def linear(u: Unknowns, source: Rates) -> Linearised:
         return linearised(problem, source, others, ways.position_m, u)
@@ -327,17 +330,53 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
     )
 
 
-def _first_activity(problem: Problem, source: Rates, others: Others, u: Unknowns) -> jax.Array:
-    """Activity [] of least squares with everything else held, at least what gives ten counts in all."""
-    m, net = problem.measurements, source.counts
+def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Unknowns:
+    """Where a fit at a new place starts: the activity, and each window's background and gain, all else as in ``u``.
+
+    Each window by itself tells an amplitude of the source, and the amplitudes are put together as the model of a
+    window's error has it. At a wrong place many windows are off by factors, to which a few Gauss-Newton steps would
+    not come.
+    """
+    m = problem.measurements
     assert m.rois is not None
-    model = linearised(problem, silent(problem), others, jnp.zeros(3), replace(u, activity_bq=jnp.zeros(())))
-    # a background that varies is part of the variance, as if it did so in each region by itself
-    variance = model.mean + jnp.square(problem.background_std * model.mean)
-    weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(variance, MEAN_FLOOR), 0.0)
-    score, information = jnp.sum(weight * net * (m.rois - model.mean)), jnp.sum(weight * net * net)
-    least = 10.0 / jnp.maximum(jnp.sum(jnp.where(m.valid[:, None], net, 0.0)), 1e-30)
-    return jnp.maximum(score / jnp.maximum(information, 1e-30), least)
+    unit = jnp.maximum(jnp.max(jnp.where(m.valid, jnp.sum(source.counts, axis=1), 0.0)), 1e-30)
+    net = source.counts / unit
+    rest = jnp.sum(others.counts * u.others[:, None, None], axis=0)
+    background = problem.background * jnp.exp(detector_of(problem) @ u.level)[:, None]
+    left = m.rois - rest - background
+    weight = problem.trust / jnp.maximum(jnp.maximum(m.rois, rest + background), MEAN_FLOOR)
+    weight = jnp.where(m.valid[:, None], weight, 0.0)
+
+    def over(x: jax.Array) -> jax.Array:
+        return jnp.sum(weight * x, axis=1)
+
+    both = over(net * background)
+    of_background = over(jnp.square(background)) + 1.0 / jnp.square(problem.background_std)
+    information = jnp.maximum(over(net * net) - jnp.square(both) / of_background, 1e-20)
+    score = over(net * left) - both * over(background * left) / of_background
+    amplitude, noise = score / information, 1.0 / information
+    variance = variance_of(problem, where) + source.edge
+    least = 10.0 / jnp.maximum(jnp.sum(jnp.where(m.valid[:, None], net, 0.0)), 1e-20)
+    tail = problem.tail
+
+    def mean(_: int, level: jax.Array) -> jax.Array:
+        beyond = jnp.maximum(jnp.square(amplitude - level) - noise, 0.0)
+        trusted = noise + (tail * variance * jnp.square(level) + beyond) / (tail + 1.0)
+        share = jnp.where(m.valid, 1.0 / trusted, 0.0)
+        return jnp.maximum(jnp.sum(share * amplitude) / jnp.sum(share), least)
+
+    level = jnp.maximum(jnp.sum(jnp.where(m.valid, score, 0.0)) / jnp.sum(information), least)
+    level = jax.lax.fori_loop(0, LEVEL_STEPS, mean, level)
+    known, total = jnp.sum(rest, axis=1), jnp.sum(net, axis=1)
+    seen, expected = amplitude * total + known, level * total + known
+    off = jnp.log(jnp.maximum(seen, 1e-3) / jnp.maximum(expected, 1e-3))
+    spread = (tail * variance + jnp.square(off)) / (tail + 1.0)
+    told = jnp.square(jnp.maximum(seen, expected) / jnp.maximum(total, 1e-20)) * information * spread
+    beyond_chance = jnp.square((amplitude - level) * FAR_OFF) * information > 1.0
+    gain = jnp.where(beyond_chance, jnp.clip(off * told / (1.0 + told), -FARTHEST_GAIN, FARTHEST_GAIN), 0.0)
+    signal = (level * net + rest) * jnp.exp(gain)[:, None]
+    of_rest = over(background * (m.rois - background - signal)) / of_background
+    return replace(u, activity_bq=level / unit, gain=gain, background=jnp.clip(of_rest, -1.0, 1.0))
 
 
 def alone(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, Linearised]:
