@@ -22,10 +22,10 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.device import each, either
-from swarmsim.estimation.fit import MEAN_FLOOR, alone, normal_equations, settle
-from swarmsim.estimation.forward import Problem, ways_from
-from swarmsim.estimation.likelihood import height_precision, scaled_inverse
-from swarmsim.estimation.search import TOGETHER, attempt, bounds
+from swarmsim.estimation.fit import MEAN_FLOOR, Others, Unknowns, alone, normal_equations, settle
+from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
+from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
+from swarmsim.estimation.search import TOGETHER, attempt, bounds, screen_of, screened, spread
 from swarmsim.estimation.sources import ALONE_STEPS, State, without
 from swarmsim.pytree import pytree
 
@@ -39,8 +39,12 @@ LEAST_EFFECTIVE = 16.0  # weights are flattened until they count as this many wh
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
 LEAST_ROUNDS = 4
 LEAST_STD_M = 1e-3
-OTHER_EACH = 4  # every fourth place of the first round may lie about a second mode
-MOVES = 3  # Gauss-Newton steps of the place towards that mode
+SCOUTS = 96  # places at which the screen looks for further modes
+SCOUTED_M = 6.0  # two thirds of them within this distance of the source, the others up to three times as far
+HEIGHTS = 1.5  # standard deviations of the height within which they lie
+LEAST_SCOUTS = 8.0  # their weights are flattened until they count as this many
+MODES = 10  # of them that are looked at
+MOVES = 3  # Gauss-Newton steps of the place towards the mode beyond the way
 LONGEST_MOVE_M = 1.0
 NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 1  # Gauss-Newton steps at a place
@@ -91,14 +95,15 @@ def sample_posterior(
     covariance: jax.Array,
     rounds: int,
     per_round: int,
-    other: jax.Array | None = None,
+    others: jax.Array | None = None,
 ) -> Posterior:
     """Moments of the posterior around ``start`` [3], whose covariance near it is about ``covariance`` [3, 3].
 
-    ``weigh`` gives the posterior at a place [3]. There are ``rounds`` of ``per_round`` places at most. A part of the
-    first ones lie about ``other`` [3], where there may be a second mode.
+    ``weigh`` gives the posterior at a place [3]. There are ``rounds`` of ``per_round`` places at most. Half of the
+    first ones lie about ``others`` [m, 3], in turn, where there may be further modes.
     """
-    starts = start if other is None else jnp.where(jnp.arange(per_round)[:, None] % OTHER_EACH == 0, other, start)
+    index = jnp.arange(per_round)[:, None]
+    starts = start if others is None else jnp.where(index % 2, others[index[:, 0] // 2 % len(others)], start)
     even = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(_EVEN), 1.0)
     normal = jax.scipy.special.ndtri(jnp.clip(even, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
     scales = _scales(per_round)
@@ -291,14 +296,30 @@ def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_ro
     known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
     known = known.at[2].set(height_precision(problem.height_std_m))
     covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
-    other = mirrored_place(problem, s.place[k], jnp.sum(state.added.counts[k], axis=1))
+    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, _modes(problem, state, k, others, u))
+
+
+def _modes(problem: Problem, state: State, k: jax.Array, others: Others, u: Unknowns) -> jax.Array:
+    """Places [m, 3] about which the posterior of source ``k`` may have further modes.
+
+    Half of them are likely ones of many all around, by the screen; the rest is the other side of the way.
+    """
+    place, nuclide = state.sources.place[k], state.sources.nuclide[k]
+    best = attempt(problem, nuclide, others, u, place).fit
+    screen = screen_of(problem, others, best.rates, position_of(problem.site, place), best.unknowns)
+    quick = with_one_ray(problem)
+    scouts = spread(place, jnp.asarray(SCOUTED_M), HEIGHTS * problem.height_std_m, SCOUTS, jnp.zeros(()))
+    scouts = jnp.clip(scouts, *bounds(problem))
+    seen = each(lambda x: screened(quick, screen, nuclide, x), scouts, TOGETHER)
+    likely = _drawn_evenly(scouts, _flattened(problem.learning_rate * seen, LEAST_SCOUTS), MODES)
 
     def nearer(_: int, place: jax.Array) -> jax.Array:
         step = attempt(problem, nuclide, others, u, place).fit.move
         return place + jnp.clip(jnp.nan_to_num(step), -LONGEST_MOVE_M, LONGEST_MOVE_M)
 
-    other = jax.lax.fori_loop(0, MOVES, nearer, other)
-    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, other)
+    mirrored = mirrored_place(problem, place, jnp.sum(state.added.counts[k], axis=1))
+    mirrored = jax.lax.fori_loop(0, MOVES, nearer, mirrored)
+    return jnp.stack([likely, jnp.broadcast_to(mirrored, likely.shape)], axis=1).reshape(-1, 3)
 
 
 def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax.Array:
