@@ -35,6 +35,7 @@ from swarmsim.site import sample
 MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count finite
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
+MORE_STEPS = 2  # of Gauss-Newton, with the rates at the lengths that the first ones came to
 LEVEL_STEPS = 8  # of the activity that the windows' own ones are put together to
 FAR_OFF = 0.25  # over the standard deviations of its counts by which a window's rate must be off to start with a gain
 FARTHEST_GAIN = 5.0  # logarithm of a window's rate over the model's, where a fit starts
@@ -285,8 +286,8 @@ def settle(
         steps: of Gauss-Newton (static).
         fresh: whether the place is a new one: then the activity and the windows' own unknowns are not taken from
             ``start`` (static).
-        exact: whether the rates are computed again with the lengths that were fitted; else they are extrapolated
-            (`lengthened`; static).
+        exact: whether the rates are computed again with the lengths that were fitted, and a few further steps done;
+            else they are extrapolated (`lengthened`; static).
     """
     source = rates(problem, ways, nuclide, start.lengths)
     if fresh:
@@ -303,6 +304,7 @@ def settle(
     (u, source), _ = jax.lax.scan(step, (start, source), None, length=steps)
     if exact and problem.uncertain:
         source = rates(problem, ways, nuclide, u.lengths)
+        (u, source), _ = jax.lax.scan(step, (u, source), None, length=MORE_STEPS)
     return _settled(problem, linear(u, source), u, ways, source)
 
 
