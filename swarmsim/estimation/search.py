@@ -29,6 +29,7 @@ GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
 FITTED = 4  # of the candidates of a round: the best of each part
 STEPS = 3  # Gauss-Newton steps at a place
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
+ROUNDING = 1e-5  # of sums over all windows, relative
 FARTHEST = 6.0  # standard deviations of a place within which others are looked for along its uncertainty
 TOGETHER = 24  # places that an accelerator looks at side by side
 
@@ -99,11 +100,13 @@ def screened(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Ar
     of_left = jnp.stack([jnp.sum(screen.own[..., k] * screen.weight * screen.left, axis=1) for k in range(2)], axis=-1)
     back = jnp.einsum("nab,nb->na", screen.inverse, inside)
     score = jnp.sum(weighted * screen.left) - jnp.sum(back * of_left)
-    information = jnp.sum(weighted * net) - jnp.sum(back * inside)
+    whole = jnp.sum(weighted * net)
+    information = whole - jnp.sum(back * inside)
     deviation = place[2] - problem.height_m
     prior = 0.5 * height_precision(problem.height_std_m) * jnp.square(deviation)
     value = 0.5 * jnp.square(jnp.maximum(score, 0.0)) / jnp.maximum(information, 1e-30) - prior
-    return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+    # what walls hide all of, and what is as nothing beside rounding, explains no count
+    return jnp.where(jnp.isfinite(value) & (information > ROUNDING * whole), value, -prior)
 
 
 def spread(centre: jax.Array, reach_m: jax.Array, up_m: jax.Array, count: int, turn: jax.Array) -> jax.Array:

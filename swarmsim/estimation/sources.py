@@ -273,7 +273,9 @@ def _best(
         places = jnp.broadcast_to(best.place, (size, 3))
         asked = jnp.pad(allowed, (0, size - known))
         kinds = jnp.minimum(everyone, known - 1)
-        return Candidates(place=places, nuclide=kinds, allowed=asked, sure=no, apart=no[0])
+        # the nuclide so far is compared with the others in any case
+        sure = asked & (everyone == best.nuclide)
+        return Candidates(place=places, nuclide=kinds, allowed=asked, sure=sure, apart=no[0])
 
     def around(best: Tried, number: jax.Array) -> Candidates:
         reach_m, index = reaches[number], jnp.arange(size)
