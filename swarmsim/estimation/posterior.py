@@ -44,7 +44,7 @@ SCOUTED_M = 6.0  # two thirds of them within this distance of the source, the ot
 HEIGHTS = 1.5  # standard deviations of the height within which they lie
 LEAST_SCOUTS = 8.0  # their weights are flattened until they count as this many
 MODES = 10  # of them that are looked at
-MOVES = 3  # Gauss-Newton steps of the place towards the mode beyond the way
+MOVES = 4  # Gauss-Newton steps of the place towards the mode beyond the way; the best of their places is taken
 LONGEST_MOVE_M = 1.0
 NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 1  # Gauss-Newton steps at a place
@@ -313,12 +313,14 @@ def _modes(problem: Problem, state: State, k: jax.Array, others: Others, u: Unkn
     seen = each(lambda x: screened(quick, screen, nuclide, x), scouts, TOGETHER)
     likely = _drawn_evenly(scouts, _flattened(problem.learning_rate * seen, LEAST_SCOUTS), MODES)
 
-    def nearer(_: int, place: jax.Array) -> jax.Array:
-        step = attempt(problem, nuclide, others, u, place).fit.move
-        return place + jnp.clip(jnp.nan_to_num(step), -LONGEST_MOVE_M, LONGEST_MOVE_M)
+    def nearer(_: int, at: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        place, best, value = at
+        fit = attempt(problem, nuclide, others, u, place).fit
+        step = jnp.clip(jnp.nan_to_num(fit.move), -LONGEST_MOVE_M, LONGEST_MOVE_M)
+        return place + step, jnp.where(fit.value > value, place, best), jnp.maximum(fit.value, value)
 
     mirrored = mirrored_place(problem, place, jnp.sum(state.added.counts[k], axis=1))
-    mirrored = jax.lax.fori_loop(0, MOVES, nearer, mirrored)
+    mirrored = jax.lax.fori_loop(0, MOVES, nearer, (mirrored, mirrored, -jnp.asarray(jnp.inf)))[1]
     return jnp.stack([likely, jnp.broadcast_to(mirrored, likely.shape)], axis=1).reshape(-1, 3)
 
 
