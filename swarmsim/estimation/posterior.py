@@ -47,7 +47,7 @@ MODES = 10  # of them that are looked at
 MOVES = 4  # Gauss-Newton steps of the place towards the mode beyond the way; the best of their places is taken
 LONGEST_MOVE_M = 1.0
 NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
-WEIGH_STEPS = 1  # Gauss-Newton steps at a place
+WEIGH_STEPS = 2  # Gauss-Newton steps at a place
 
 
 @pytree
