@@ -2,6 +2,7 @@
 
     python -m experiments.validation.missions random_recon --missions 256 --out out/works_yard
     python -m experiments.validation.missions random_recon --set site=meadows --missions 64 --out out/meadows
+    python -m experiments.validation.missions random_recon --without-sources --missions 256 --out out/none
 
 Writes ``sources.csv`` (a row for each true source and each false one), ``summary.json`` and ``errors.png``. A true
 source counts as found by the estimate next to it, up to 25 m away. It is detectable where the same likelihood, with all
@@ -43,8 +44,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
+    parser.add_argument("--without-sources", action="store_true", help="fly the mission without any source")
     options = parser.parse_args(arguments)
-    simulation = swarmsim.build(swarmsim.load(options.mission, options.set))
+    settings = options.set + (_without_sources(options.mission, options.set) if options.without_sources else [])
+    simulation = swarmsim.build(swarmsim.load(options.mission, settings))
     seeds = range(options.seed, options.seed + options.missions)
     batch = simulation.rollout(seeds)
     detectable = _detectable(simulation, batch)
@@ -63,6 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     (options.out / "summary.json").write_text(json.dumps(summary, indent=1))
     _figure(rows, options.out / "errors.png")
     print(json.dumps(summary))
+
+
+def _without_sources(mission: str, settings: list[str]) -> list[str]:
+    """Settings that take all sources, and what is drawn of them, out of a mission."""
+    drawn = swarmsim.load(mission, settings).mission.vary
+    return ["sources=[]", *(f"vary.{path}=null" for path in drawn if path.split(".")[0] == "sources")]
 
 
 def _detectable(simulation: Any, batch: Any) -> list[np.ndarray]:
@@ -175,6 +184,7 @@ def summarised(records: Sequence[MissionRecord], rows: Sequence[dict[str, Any]])
         "true": sum(r["true"] is not None for r in rows),
         "found": len(matched),
         "false": len(false),
+        "false_alarms": _share([bool(record.estimates) for record in records if not record.sources]),
         "false_located": sum(r["status"] == "located" for r in false),
         "located_sources": len(located),
         "located_inside_95": _share([r["sigmas"] < INSIDE_95 for r in located]),

@@ -5,7 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from experiments.validation.missions import matches, rows_of, summarised
+import swarmsim
+
+from experiments.validation.missions import _without_sources, matches, rows_of, summarised
 
 ASKED = (30.0, 60.0)
 
@@ -73,6 +75,7 @@ def test_shares_are_of_those_that_they_speak_of():
     assert told["statuses"] == {"located": 4, "ambiguous": 1, "none": 1}
     assert (told["true"], told["found"], told["false"], told["false_located"]) == (6, 4, 2, 1)
     assert told["located_sources"] == 3
+    assert told["false_alarms"] == 1.0  # of the one mission without a source
     assert told["located_inside_95"] == pytest.approx(2 / 3)
     assert told["located_beyond_5_sigma"] == pytest.approx(1 / 3)
     assert told["all_inside_95"] == pytest.approx(2 / 4)  # errors of 1, 8, 3 and 0 standard deviations
@@ -81,3 +84,12 @@ def test_shares_are_of_those_that_they_speak_of():
     assert told["detectable_and_resolved"] == 3
     assert told["of_those_number_right"] == pytest.approx(2 / 3)
     assert told["of_those_located"] == pytest.approx(2 / 3)
+
+
+def test_a_family_without_sources_draws_everything_else_as_before():
+    built = swarmsim.build(swarmsim.load("random_recon", _without_sources("random_recon", [])))
+    whole = swarmsim.build(swarmsim.load("random_recon"))
+    drawn, before = (b.draw(range(3)).values for b in (built, whole))
+    assert not any(path.startswith("sources") for path in drawn)
+    assert all(list(drawn[path]) == list(before[path]) for path in drawn)
+    assert built.world_of(0).sources.activity_bq.sum() == 0.0
