@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import swarmsim
-
 from experiments.validation.missions import _without_sources, matches, rows_of, summarised
 
 ASKED = (30.0, 60.0)
