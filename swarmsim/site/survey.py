@@ -9,17 +9,20 @@ from swarmsim.config.site import SiteSpec
 from swarmsim.site.raster import Floats, Grid
 
 VERTICES_MAX = 32
+INSET_M = 5.0  # a quadrotor at 5 m/s comes to rest in it
+INSET_SHARE = 0.05  # of the smaller side, on a small site
 
 
 def survey_area(grid: Grid, inside: NDArray[np.bool_], spec: SiteSpec) -> Floats:
     """Convex polygon [v, 2] in m, ENU, counter-clockwise.
 
-    It is the specification's, or else the convex hull of the cells ``inside`` [ny, nx], inset by one metre or one cell,
-    whichever is larger. Raises `InputError` when the specification's reaches beyond the site.
+    It is the specification's, or else the convex hull of the cells ``inside`` [ny, nx], inset so far that a vehicle at
+    the end of a line can stop before the fence, which is the site's outline. Raises `InputError` when the
+    specification's reaches beyond the site.
     """
     if spec.survey_area_m is not None:
         return _inside_site(grid, np.array(spec.survey_area_m))
-    inset = max(1.0, grid.cell)
+    inset = max(grid.cell, min(INSET_M, INSET_SHARE * min(grid.nx, grid.ny) * grid.cell))
     depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * grid.cell
     core = depth > inset if (depth > inset).any() else inside
     rows = np.flatnonzero(core.any(axis=1))

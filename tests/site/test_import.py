@@ -319,3 +319,10 @@ def test_trimesh_colours_are_kept(tmp_path):
     colours = {tuple(c) for c in raw.mesh.colours.tolist()}
     assert (200, 60, 40, 255) in colours
     assert len(colours) == 3
+
+
+@pytest.mark.parametrize(("side", "room"), [(200.0, 5.0), (40.0, 2.0)])
+def test_lines_over_a_site_end_where_a_vehicle_can_stop_before_the_fence(tmp_path, side, room):
+    plate = trimesh.creation.box(extents=(side, side, 0.01))
+    area = built(tmp_path, trimesh.Scene({"plate": plate})).survey_area
+    assert np.all(np.abs(0.5 * side - np.abs(area) - room) < 1.1)  # to a cell
