@@ -174,7 +174,7 @@ class Knowledge(Model):
     background_std: float = Field(default=0.3, ge=0.01, le=1)
     model_std: float = Field(default=0.05, ge=0.001, le=1)
     spectrum_std: float = Field(default=0.02, ge=0, le=1)
-    learning_rate: float = Field(default=0.5, ge=0.01, le=1)
+    learning_rate: float = Field(default=0.8, ge=0.01, le=1)
     activity_mbq: float = Field(default=100.0, ge=1e-6, le=1e9)
     activity_factor: float = Field(default=10.0, ge=1.1, le=1e9)
     nuclides: Literal["unknown"] | Annotated[tuple[Name, ...], Field(min_length=1, max_length=100)] = "unknown"

@@ -158,6 +158,20 @@ def test_the_mean_does_not_depend_on_where_sampling_starts():
     assert np.all(np.ptp(np.asarray(means), axis=0) < 0.4 * std)
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_a_source_beside_a_straight_way_may_lie_on_either_side_of_it(seed):
+    way = np.column_stack([np.linspace(-30.0, 30.0, 231), np.full(231, 4.0), np.full(231, 0.6)])
+    known = presumed(place(), (detector(),), knowledge=Knowledge(site="exact"), height_std_m=1e-3)
+    at = jnp.array([2.0, 6.0, 1.0])
+    counts = drawn_of_one(place(), detector(), windows(way), at, ACTIVITY, seed)
+    problem = problem_of(known, counts, SPANS)
+    found = _sample(problem, _state(problem, at))
+    across = float(jnp.sqrt(found.covariance[1, 1]))
+    assert across > 1.0  # of two metres to each side
+    assert abs(float(found.mean[1]) - 4.0) < 2.0
+    assert float(jnp.sqrt(found.covariance[0, 0])) < 0.2
+
+
 def test_without_any_measurement_the_moments_are_finite():
     problem, state = told([], 0)
     m = problem.measurements

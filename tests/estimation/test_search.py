@@ -1,0 +1,91 @@
+"""Fits at places where the source is not, and the steps that lead from them to where it is."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.config.mission import Knowledge
+from swarmsim.estimation.fit import settle
+from swarmsim.estimation.forward import ways_from
+from swarmsim.estimation.localise import problem_of
+from swarmsim.estimation.measurements import concatenate
+from swarmsim.estimation.search import Tried, attempt, spread_along
+from swarmsim.estimation.sources import no_sources
+from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spectrometer, survey
+
+CO_60 = jnp.int32(NUCLIDES.index("Co-60"))
+DETECTORS = (spectrometer(),)
+FLIGHT = survey(altitude=12.0, count=60, half=40.0, lines=6)
+DRIVE = replace(orbit((3.0, 3.0), 5.0, 40), detector=jnp.zeros(40, jnp.int32))
+BOTH = concatenate(FLIGHT, DRIVE)
+SPANS = ((0, 60, 0, 1), (60, 100, 0, 1))
+WALLS = [((0.5, 3.0, 1.5), (0.15, 4.0, 1.5), "concrete"), ((3.0, 6.5, 1.5), (2.5, 0.1, 1.5), "steel")]
+AT = np.array([3.0, 3.5, 1.0])
+
+
+def told(boxes, activity=4e8):
+    site = place(boxes, half=40.0)
+    m = drawn(BOTH, mean_rois(site, DETECTORS, BOTH, [(AT, activity, "Co-60")]), 3)
+    return presumed(site, DETECTORS, half=40.0, knowledge=Knowledge(site="geometry")), m
+
+
+@jax.jit
+def _fitted(known, m, places):
+    problem = problem_of(known, m, SPANS)
+    nothing = no_sources(problem, 1, len(NUCLIDES))
+
+    def one(at):
+        ways, u, others = ways_from(problem, at), nothing.unknowns, nothing.added
+        few = attempt(problem, CO_60, others, u, at).fit
+        return few.value, settle(problem, ways, CO_60, others, u, 40, fresh=True).value, few.move
+
+    return jax.lax.map(one, places)
+
+
+def test_a_few_steps_come_as_far_as_many_wherever_the_source_is_sought():
+    """Places up to 9 m off, where windows are off by factors of ten."""
+    known, m = told(WALLS)
+    rng = np.random.default_rng(0)
+    places = np.concatenate([AT[None], AT + np.column_stack([rng.uniform(-6, 6, (40, 2)), rng.uniform(-0.5, 1, 40)])])
+    few, many, _ = (np.asarray(x, np.float64) for x in _fitted(known, m, jnp.float32(places)))
+    lost = many[0] - many
+    assert lost[1:].min() > 50.0
+    assert abs(few[0] - many[0]) < 0.1
+    short = np.abs(few - many)[1:] / lost[1:]  # of the value that the wrong place costs
+    assert np.median(short) < 0.08
+    assert np.quantile(short, 0.9) < 0.35
+    assert short.max() < 0.75
+
+
+def test_a_step_of_the_place_leads_to_a_source_in_the_open():
+    known, m = told([])
+    rng = np.random.default_rng(1)
+    places = AT + np.column_stack([rng.uniform(-0.6, 0.6, (12, 2)), np.zeros(12)])
+    move = np.asarray(_fitted(known, m, jnp.float32(places))[2])
+    left = np.linalg.norm((places + move - AT)[:, :2], axis=1)
+    assert np.all(left < 0.15)
+    assert np.median(left) < 0.06
+
+
+@pytest.mark.parametrize("reach", [0.05, 2.0])
+def test_places_along_the_uncertainty_follow_its_ridge(reach):
+    known, m = told([])
+
+    @jax.jit
+    def spread(known, m, at):
+        problem = problem_of(known, m, SPANS)
+        nothing = no_sources(problem, 1, len(NUCLIDES))
+        fit = attempt(problem, CO_60, nothing.added, nothing.unknowns, at).fit
+        ridge = replace(fit, towards=jnp.diag(jnp.array([1e4, 1.0, 1e4])), move=jnp.array([0.03, -9.0, 0.0]))
+        best = Tried(place=at, nuclide=CO_60, fit=ridge)
+        return spread_along(problem, best, jnp.float32(reach), 12, jnp.float32(0.0))
+
+    places = np.asarray(spread(known, m, jnp.float32(AT))) - AT
+    # where the step leads, within reach
+    np.testing.assert_allclose(places[0], [0.03, -reach, 0.0], atol=1e-5)
+    across, along = np.abs(places[1:, 0]).max(), np.abs(places[1:, 1]).max()
+    assert 0.5 * reach < along < 3.1 * reach
+    assert across < 0.05 * along
