@@ -225,8 +225,9 @@ def _figure(rows: Sequence[dict[str, Any]], path: Path) -> None:
     r = np.linspace(0, 6, 200)
     right.plot(r, 1 - np.exp(-0.5 * r * r), "k-", lw=0.8, label="normal")
     right.set(xlim=(0, 8), xlabel="error over stated standard deviation (2-D)", ylabel="share of sources")
-    left.legend()
-    right.legend()
+    for axes in (left, right):
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend()
     figure.savefig(path, dpi=150)
     plt.close(figure)
 

@@ -68,6 +68,29 @@ def test_expected_counts_at_the_true_place_give_the_truth(boxes, name):
         assert abs(float(fit.likelihood)) < 0.5
 
 
+def test_the_prior_of_the_activity_is_in_the_value_and_not_in_the_likelihood():
+    at, activity = jnp.array([5.0, 3.0, 1.0]), 500e6
+    fits = []
+    for presumed_mbq in (100.0, 1e5):
+        knowledge = Knowledge(site="exact", activity_mbq=presumed_mbq, activity_factor=3.0)
+        known, m = told(place(half=40.0), [(at, activity, "Cs-137")], knowledge)
+        fits.append(_settled(known, m, at, jnp.int32(NUCLIDES.index("Cs-137")))[0])
+    assert abs(float(fits[0].likelihood - fits[1].likelihood)) < 1e-3
+    excess = np.log(activity / np.array([100e6, 1e11])) / np.log(3.0)
+    np.testing.assert_allclose(fits[0].value - fits[1].value, 0.5 * (excess[1] ** 2 - excess[0] ** 2), rtol=0.01)
+
+
+def test_a_window_that_lacks_half_its_counts_costs_a_few_nats_and_moves_nothing():
+    """Student's tails: a post that no ray met takes counts from one window."""
+    at, k = jnp.array([5.0, 3.0, 1.0]), jnp.int32(NUCLIDES.index("Cs-137"))
+    known, m = told(place(half=40.0), [(at, 2e9, "Cs-137")], Knowledge(site="exact"))
+    nearest = int(jnp.argmin(jnp.linalg.norm(m.position_m - at, axis=1)))
+    fits = [_settled(known, x, at, k)[0] for x in (m, replace(m, rois=m.rois.at[nearest].multiply(0.6)))]
+    assert 4.0 < float(fits[0].likelihood - fits[1].likelihood) < 15.0
+    np.testing.assert_allclose(fits[1].unknowns.activity_bq, fits[0].unknowns.activity_bq, rtol=0.005)
+    assert float(fits[1].unknowns.gain[nearest]) == pytest.approx(np.log(0.6), abs=0.1)
+
+
 def test_a_wrong_nuclide_at_the_true_place_explains_the_counts_less():
     known, m = told(place(half=40.0), [((5.0, 3.0, 1.0), 500e6, "Cs-137")])
     values = [
