@@ -2,7 +2,8 @@
 
 Where walls throw shadows the posterior is a ragged funnel: it rises towards the source over metres but has steps of
 several nats every half metre, over which no gradient leads. A screen, which holds all that a fit knows of the
-background and of other sources, looks at many places for the price of few fits.
+background and of other sources, looks at many places for the price of few fits. Close to a strong source in the open it
+is a ridge: some of the places lie along it, and one is where a Gauss-Newton step leads.
 """
 
 from dataclasses import replace
