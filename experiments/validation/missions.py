@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
     parser.add_argument("--without-sources", action="store_true", help="fly the mission without any source")
     options = parser.parse_args(arguments)
-    settings = options.set + (_without_sources(options.mission, options.set) if options.without_sources else [])
+    settings = options.set + (without_sources(options.mission, options.set) if options.without_sources else [])
     simulation = swarmsim.build(swarmsim.load(options.mission, settings))
     seeds = range(options.seed, options.seed + options.missions)
     batch = simulation.rollout(seeds)
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(json.dumps(summary))
 
 
-def _without_sources(mission: str, settings: list[str]) -> list[str]:
+def without_sources(mission: str, settings: list[str]) -> list[str]:
     """Settings that take all sources, and what is drawn of them, out of a mission."""
     drawn = swarmsim.load(mission, settings).mission.vary
     return ["sources=[]", *(f"vary.{path}=null" for path in drawn if path.split(".")[0] == "sources")]

@@ -37,7 +37,7 @@ LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
 LOWEST_SHARE = 0.1  # of the activity that is left after one step
 MORE_STEPS = 2  # of Gauss-Newton, with the rates at the lengths that the first ones came to
 LEVEL_STEPS = 8  # of the activity that the windows' own ones are put together to
-FAR_OFF = 0.25  # over the standard deviations of its counts by which a window's rate must be off to start with a gain
+FAR_OFF = 4.0  # standard deviations of its counts, from which on the gain of a window does not start at zero
 FARTHEST_GAIN = 5.0  # logarithm of a window's rate over the model's, where a fit starts
 LOOSE = 1e-4  # precision of what has no prior
 FLAT = 1e-6  # 1/m^2, precision of a place that no count tells of
@@ -335,9 +335,8 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
 def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Unknowns:
     """Where a fit at a new place starts: the activity, and each window's background and gain, all else as in ``u``.
 
-    Each window by itself tells an amplitude of the source, and the amplitudes are put together as the model of a
-    window's error has it. At a wrong place many windows are off by factors, to which a few Gauss-Newton steps would
-    not come.
+    Each window by itself tells an amplitude of the source; they are put together as the model of a window's error has
+    it. At a wrong place many windows are off by factors, to which a few Gauss-Newton steps would not come.
     """
     m = problem.measurements
     assert m.rois is not None
@@ -374,7 +373,8 @@ def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u:
     off = jnp.log(jnp.maximum(seen, 1e-3) / jnp.maximum(expected, 1e-3))
     spread = (tail * variance + jnp.square(off)) / (tail + 1.0)
     told = jnp.square(jnp.maximum(seen, expected) / jnp.maximum(total, 1e-20)) * information * spread
-    beyond_chance = jnp.square((amplitude - level) * FAR_OFF) * information > 1.0
+    # below that a heavy tail would hold the chance of few counts for an error of the model
+    beyond_chance = jnp.square(amplitude - level) * information > FAR_OFF**2
     gain = jnp.where(beyond_chance, jnp.clip(off * told / (1.0 + told), -FARTHEST_GAIN, FARTHEST_GAIN), 0.0)
     signal = (level * net + rest) * jnp.exp(gain)[:, None]
     of_rest = over(background * (m.rois - background - signal)) / of_background

@@ -9,7 +9,7 @@ from swarmsim.config.site import SiteSpec
 from swarmsim.site.raster import Floats, Grid
 
 VERTICES_MAX = 32
-INSET_M = 5.0  # a quadrotor at 5 m/s comes to rest in it
+INSET_M = 5.0  # a quadrotor at 4 m/s that brakes with 4 m/s^2 after 0.4 s comes to rest in 3.6 m
 INSET_SHARE = 0.05  # of the smaller side, on a small site
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import swarmsim
-from experiments.validation.missions import _without_sources, matches, rows_of, summarised
+from experiments.validation.missions import matches, rows_of, summarised, without_sources
 
 ASKED = (30.0, 60.0)
 
@@ -85,8 +85,8 @@ def test_shares_are_of_those_that_they_speak_of():
     assert told["of_those_located"] == pytest.approx(2 / 3)
 
 
-def test_a_family_without_sources_draws_everything_else_as_before():
-    built = swarmsim.build(swarmsim.load("random_recon", _without_sources("random_recon", [])))
+def test_a_familywithout_sources_draws_everything_else_as_before():
+    built = swarmsim.build(swarmsim.load("random_recon", without_sources("random_recon", [])))
     whole = swarmsim.build(swarmsim.load("random_recon"))
     drawn, before = (b.draw(range(3)).values for b in (built, whole))
     assert not any(path.startswith("sources") for path in drawn)
