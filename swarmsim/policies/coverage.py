@@ -96,7 +96,8 @@ class ParallelLinesPlanner:
         across the lines, so that their ways do not cross. Every UAV flies its part in the order and direction with the
         least transit.
         """
-        start, end, used = _pieces(*_cut_lines(task), task.bands)
+        lines = survey_lines(task.area_m, task.sweep_rad, task.line_spacing_m, task.lines_max)
+        start, end, used = _pieces(*lines, task.bands)
         share = _share(start, end, used, task.home_m.shape[0])
         rank = _places_in_order(task, situation.position_m[:, :2])
 
@@ -107,15 +108,20 @@ class ParallelLinesPlanner:
         return jax.vmap(fly)(situation.position_m, task.home_m, rank)
 
 
-def _cut_lines(task: SurveyTask) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Line ends [L, 2], [L, 2] in ENU and which of the L lines are used."""
-    along = jnp.array([jnp.cos(task.sweep_rad), jnp.sin(task.sweep_rad)])
+def survey_lines(
+    area_m: jax.Array, sweep_rad: jax.Array, line_spacing_m: jax.Array, lines_max: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Ends [L, 2], [L, 2] (m, ENU) of parallel lines through a convex area [V, 2], and which of the L lines are used.
+
+    ``L`` is ``lines_max``, ``sweep_rad`` [] the direction of the lines, counter-clockwise from east.
+    """
+    along = jnp.array([jnp.cos(sweep_rad), jnp.sin(sweep_rad)])
     across = jnp.array([-along[1], along[0]])
-    u, v = task.area_m @ along, task.area_m @ across
+    u, v = area_m @ along, area_m @ across
     height = v.max() - v.min()
-    count = jnp.clip(jnp.floor(height / task.line_spacing_m + 1e-6), 1, task.lines_max)
-    k = jnp.arange(task.lines_max)
-    at = 0.5 * (v.max() + v.min()) + (k - 0.5 * (count - 1)) * task.line_spacing_m
+    count = jnp.clip(jnp.floor(height / line_spacing_m + 1e-6), 1, lines_max)
+    k = jnp.arange(lines_max)
+    at = 0.5 * (v.max() + v.min()) + (k - 0.5 * (count - 1)) * line_spacing_m
     # intersections of every line with every edge of the polygon
     u2, v2 = jnp.roll(u, -1), jnp.roll(v, -1)
     crosses = (jnp.minimum(v, v2) <= at[:, None]) & (at[:, None] < jnp.maximum(v, v2))

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmsim.config.scenario import Scenario
-from swarmsim.config.site_checks import OVERHEAD_M, Ground
+from swarmsim.config.site_ground import Ground
+from swarmsim.config.start_checks import OVERHEAD_M
 from swarmsim.config.vary import PlaceIn, Region
 from swarmsim.site.model import SiteModel, height_at
 from swarmsim.site.raster import in_polygon

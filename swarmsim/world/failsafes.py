@@ -85,6 +85,11 @@ def no_rescue() -> Rescue:
     )
 
 
+def stopping_m(velocity_m_s: jax.Array, brake_m_s2: jax.Array | float) -> jax.Array:
+    """How far a vehicle at ``velocity_m_s`` goes, m with its sign, that reacts and brakes by ``brake_m_s2``."""
+    return REACTION_S * velocity_m_s + 0.5 * velocity_m_s * jnp.abs(velocity_m_s) / brake_m_s2
+
+
 def failing(
     rules: FailsafeRules, rescue: Rescue, *, position_m: jax.Array, velocity_m_s: jax.Array, brake_m_s2: jax.Array,
     above_m: jax.Array, carried_m_s: jax.Array, charge: jax.Array, home_m: jax.Array, dt: float,
@@ -97,7 +102,7 @@ def failing(
     battery, ``home_m`` [2] where it started.
     """
     level = position_m[:2]
-    stop = REACTION_S * velocity_m_s + 0.5 * velocity_m_s * jnp.abs(velocity_m_s) / brake_m_s2
+    stop = stopping_m(velocity_m_s, brake_m_s2)
     ahead, up = level + stop[:2], above_m + stop[2]
     outside = jnp.any((ahead < rules.fence_low_m) | (ahead > rules.fence_high_m)) | (up > rules.ceiling_m)
     drifts = (carried_m_s > rules.wind_drift_m_s) | (rescue.takes_over & (rescue.carried_s > ADRIFT_S))

@@ -1,5 +1,7 @@
 """Scenarios against the ground of a site with one hollow building, one solid wall and one hedge."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -75,6 +77,12 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
         (f"{SURVEY}.area_m=[[0, 0], [200, 0], [0, 60]]", f"{FIRST}.area_m", ["reaches beyond the site", "[200, 0]"]),
         (f"{SURVEY}.area_m=[[0, 0], [5, 0], [5, 60], [0, 60]]", f"{FIRST}.area_m", ["no room for one", "10 m"]),
         (f"{SURVEY}.line_spacing_m=130", FIRST, ["no room for one survey line", "smaller line_spacing_m"]),
+        (
+            f"{SURVEY}.area_m=[[-79, -60], [70, -60], [70, 60], [-79, 60]]", f"{FIRST}.area_m",
+            ["a survey line ends so near to the fence", "1 m from the fence, at [-79, ", "at least 1.78 m"],
+        ),
+        (f"{SURVEY}.speed_m_s=8", f"{FIRST}.speed_m_s", ["at 8 m/s could not stop", "10 m from", "at least 11.2 m"]),
+        ("failsafes.fence.margin_m=8.4", f"{FIRST}.speed_m_s", ["1.6 m from the fence", "a lower speed_m_s"]),
         ("phases.search.settings.target=[0, 90]", "phases.1.settings.target", ["the target lies outside"]),
         (f"phases.1={ROUND}", "phases.1.settings.points.1", ["the waypoint lies outside the site", "y from -70 to 70"]),
     ],
@@ -101,6 +109,34 @@ def test_what_does_not_fit(mission: Path, site: SiteModel, override: str, path: 
 )
 def test_what_fits_though_it_is_near(mission: Path, site: SiteModel, override: str) -> None:
     assert check_site(load_scenario(mission, [override]), site) == []
+
+
+@pytest.mark.parametrize("override", ["[-70, -60], [-78.2, 0], [-70, 60]", "[-77, 0], [0, -69.9], [77, 0], [0, 69.9]"])
+def test_lines_may_end_as_near_to_the_fence_as_a_vehicle_stops(mission: Path, site: SiteModel, override: str) -> None:
+    scenario = load_scenario(mission, [f"{SURVEY}.area_m=[{override}]", f"{SURVEY}.line_spacing_m=8"])
+    assert check_site(scenario, site) == []
+
+
+@pytest.mark.parametrize(
+    ("member", "given", "within_m"),
+    [("uav1", [0, 8], 3.2), ("uav2", [-90, 70], 12.5), ("orpheus", [-75, 0], 9.2)],
+)
+def test_the_nearest_start_with_room_is_one(
+    mission: Path, site: SiteModel, member: str, given: list[float], within_m: float
+) -> None:
+    with_room = check_site(load_scenario(mission, [f"vehicles.{member}.position_m={given}"]), site)[0].suggestion
+    assert with_room is not None
+    place = with_room.rpartition("about ")[2]
+    assert check_site(load_scenario(mission, [f"vehicles.{member}.position_m={place}"]), site) == []
+    assert np.hypot(*(np.array(json.loads(place)) - given)) < within_m
+
+
+def test_no_start_is_told_where_there_is_none_near(mission: Path, site: SiteModel) -> None:
+    problems = check_site(load_scenario(mission, ["vehicles.orpheus.position_m=[-400, 0]"]), site)
+    assert "nearest place" in problems[0].suggestion  # from the site's edge on
+    closed = replace(site, site=replace(site.site, clearance_m=-jnp.ones_like(site.site.clearance_m)))
+    problems = check_site(load_scenario(mission, []), closed)
+    assert ["nearest place" in (problem.suggestion or "") for problem in problems] == [False]
 
 
 def test_the_members_of_a_formation_are_told_once(mission: Path, site: SiteModel) -> None:

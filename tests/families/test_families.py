@@ -8,7 +8,7 @@ import pytest
 
 import swarmsim
 from swarmsim.cli import main
-from swarmsim.config.site_checks import Ground
+from swarmsim.config.site_ground import Ground
 from swarmsim.config.values import with_values
 
 SEEDS = range(60)
