@@ -120,12 +120,13 @@ def rows_of(record: MissionRecord, ratio: np.ndarray, asked: tuple[float, float]
         places = [np.linalg.norm(source.position_m[:2] - o.position_m[:2]) for o in active if o is not source]
         row = {"seed": record.seed, "status": record.status, "true": source.nuclide, "mbq": source.activity_mbq,
                "region": record.drawn.get(f"sources.{number}.region"), "apart_m": min(places, default=np.inf),
-               "true_ratio": seen[number], "detectable": seen[number] > least, "found": None}  # fmt: skip
+               "true_ratio": seen[number], "detectable": seen[number] > least, "finding": record.finding,
+               "found": None}  # fmt: skip
         rows.append(row | _judged(matched.get(number), source))
     for k, estimate in enumerate(record.estimates):
         if k not in {id_ for id_, _ in matched.values()}:
             row = {"seed": record.seed, "status": record.status, "true": None, "mbq": 0.0, "region": None,
-                   "apart_m": None, "true_ratio": None, "detectable": None}  # fmt: skip
+                   "apart_m": None, "true_ratio": None, "detectable": None, "finding": record.finding}  # fmt: skip
             rows.append(row | _judged((k, estimate), None))
     return rows
 

@@ -25,7 +25,13 @@ def estimate(x, y=0.0, nuclide="Co-60", activity=100.0, std=0.5):
 def record(sources, estimates, status="located", seed=0):
     drawn = {f"sources.{i}.region": "open" for i in range(len(sources))}
     return SimpleNamespace(
-        seed=seed, status=status, sources=tuple(sources), estimates=tuple(estimates), drawn=drawn, site="yard"
+        seed=seed,
+        status=status,
+        sources=tuple(sources),
+        estimates=tuple(estimates),
+        drawn=drawn,
+        site="yard",
+        finding="told",
     )
 
 
