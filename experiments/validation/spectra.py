@@ -146,5 +146,6 @@ def without(detector: Detector, nuclide: int) -> Detector:
         *("scatter_1_m", "peak_spectrum", "scattered_bins", "line_energy_kev", "peak_orders"),
         *("ground", "ground_bins", "ground_rois"),
     ]
+    stranger = jnp.asarray(detector.stranger).at[nuclide].set(1.0)
     left: dict[str, Any] = {name: jnp.delete(getattr(detector, name), nuclide, axis=0) for name in tables}
-    return replace(detector, nuclide_names=detector.nuclide_names[:-1], **left)
+    return replace(detector, nuclide_names=detector.nuclide_names[:-1], stranger=stranger, **left)

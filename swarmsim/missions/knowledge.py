@@ -39,6 +39,7 @@ class Accumulated:
 
     counts: jax.Array  # [channels]
     live_s: jax.Array  # []
+    begin_s: jax.Array  # [] when the first of them began; inf without one
 
 
 @pytree
@@ -145,6 +146,7 @@ def accumulate_spectrum(
     # an idealised counter draws counts that stand for one second, whatever its period is
     per_exposure = detector.sample_period_s if detector.kind == "paper_ideal" else jnp.ones(())
     live = jnp.where(used, samples.exposure_s * per_exposure, 0.0)
+    begin_s = jnp.min(jnp.where(used, samples.time_s - samples.exposure_s, jnp.inf))
     expected = expected_spectrum(key, world, model, trail)
 
     def add(total: jax.Array, sample: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:
@@ -155,7 +157,7 @@ def accumulate_spectrum(
     start = jnp.zeros_like(detector.background_spectrum)
     mean = jax.lax.scan(add, start, (samples.position_m, samples.axis, samples.time_s - 0.5 * live, live))[0]
     keys = jax.random.split(randomness.consumer(key, "spectrum"), mean.shape[0])
-    return Accumulated(counts=jax.vmap(poisson)(keys, mean), live_s=jnp.sum(live))
+    return Accumulated(counts=jax.vmap(poisson)(keys, mean), live_s=jnp.sum(live), begin_s=begin_s)
 
 
 def detector_of(world: World, model: int) -> Detector:

@@ -37,6 +37,7 @@ from swarmsim.radiation.response import (
     line_spectra,
     normalised,
 )
+from swarmsim.radiation.strangers import others_than, spectra_of
 
 Floats = NDArray[np.float64]
 
@@ -86,11 +87,15 @@ class Detector:
     bin_orders: jax.Array  # [SPECTRUM_BINS, GAINS, ORDERS, bins] bin_spectrum likewise
     natural_orders: jax.Array  # [GAINS, 2, ORDERS, bins] the background's shape, and that times lines.tilt
     grid_spectrum: jax.Array  # [shields, grid, bins] of lines half a FWHM apart behind walls; sum to 1
+    known_spectrum: jax.Array  # [K shields, GAINS, bins] of all nuclides that are known of (radiation.strangers)
+    known_scattered: jax.Array  # [K shields, bins] the part of scattered photons in them
+    stranger: jax.Array  # [K] 1 for those that are none of the nuclides above, else 0
     background_spectrum: jax.Array  # [channels] cps, sums to background_cps
     energy_kev: jax.Array  # [channels] centre of each channel
     sigma_kev: jax.Array  # [channels] standard deviation of a peak there
     line_energy_kev: jax.Array  # [N, L]
     nuclide_names: tuple[str, ...] = static()
+    known_names: tuple[str, ...] = static()
     material_names: tuple[str, ...] = static()
     kind: str = static()  # physical | paper_ideal
     identification_bins: tuple[int, ...] = static()  # first channel of each bin of identification; () without
@@ -130,6 +135,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
     attenuation, coefficients, bins = _transport(library, energy, counted)
     ground, ground_bins = _ground(energy, counted)
     f32 = on_device
+    known = library.nuclides + others_than(library.nuclide_names)
     return Detector(
         radius_m=f32(radius),
         length_m=f32(length),
@@ -151,6 +157,8 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         ground_bins=f32(ground_bins),
         line_energy_kev=f32(energy),
         nuclide_names=library.nuclide_names,
+        known_names=tuple(nuclide.name for nuclide in known),
+        stranger=f32(np.arange(len(known)) >= len(library.nuclides)),
         material_names=library.material_names,
         kind=kind,
         **_spectra(spec, library, response, energy, bins, ground_bins, counted),
@@ -174,7 +182,8 @@ def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
     last_but_one = ("scatter_1_m", "scattered_bins", "scattered_rois")
     tables = {name: getattr(detector, name)[rows, :lines] for name in second}
     tables |= {name: getattr(detector, name)[rows][..., :lines, :] for name in last_but_one}
-    return replace(detector, nuclide_names=nuclides, **tables)
+    stranger = np.array([name not in nuclides for name in detector.known_names], np.float32)
+    return replace(detector, nuclide_names=nuclides, stranger=on_device(stranger), **tables)
 
 
 def lines_of(library: Library) -> tuple[Floats, Floats]:
@@ -271,6 +280,8 @@ def _spectra(
             "bin_orders": f32(np.zeros((SPECTRUM_BINS, 1, 1, 1))),
             "natural_orders": f32(np.zeros((1, 2, 1, 1))),
             "grid_spectrum": f32(np.ones((1, 1, 1))),
+            "known_spectrum": f32(np.ones((1, 1, 1))),
+            "known_scattered": f32(np.ones((1, 1))),
             "background_spectrum": f32(np.array([spec.background.rate_cps])),
             "energy_kev": f32(np.array([662.0])),
             "sigma_kev": f32(np.array([662.0])),
@@ -286,6 +297,7 @@ def _spectra(
     natural = orders(response, shape * np.stack([np.ones_like(shape), tilt(response.channel_centre_kev)]))
     peak_orders = orders(response, peaks)[back].reshape(*energy.shape, len(GAINS), ORDERS, -1)
     rois = rois_of(response, spec.spectrometer.rois_kev)
+    known = spectra_of(response, library.nuclides + others_than(library.nuclide_names), library.materials, counted)
     return {
         "peak_spectrum": f32(peaks[back].reshape(*energy.shape, -1)),
         "bin_spectrum": f32(of_bins),
@@ -293,6 +305,8 @@ def _spectra(
         "bin_orders": f32(orders(response, of_bins)),
         "natural_orders": f32(np.swapaxes(natural, 0, 1)),
         "grid_spectrum": f32(shielded_lines(response, library.materials, counted)),
+        "known_spectrum": f32(known.total),
+        "known_scattered": f32(known.scattered),
         "peak_rois": f32((peaks @ rois)[back].reshape(*energy.shape, -1)),
         "scattered_rois": f32(bins @ of_bins @ rois),
         "ground_rois": f32(ground_bins @ of_bins @ rois),

@@ -1,8 +1,9 @@
 """Bayesian identification of the nuclides in a spectrum (device side).
 
-The hypotheses: background only; one nuclide; two or three nuclides; something that the library does not hold, which is
-a few lines of any energies. A nuclide is bare, above the ground, or behind one of many shields (water, concrete, steel,
-lead of some depth, air), with more or fewer scattered photons than that would make; so are lines.
+The hypotheses: background only; one nuclide; two or three nuclides; a stranger, which is a nuclide that is known of but
+not looked for (`swarmsim.radiation.strangers`), or else a few lines of any energies. A nuclide is bare, above the
+ground, or behind one of many shields (water, concrete, steel, lead of some depth, air), with more or fewer scattered
+photons than that would make; so are lines.
 The evidence of each hypothesis is the mean of the likelihood over shields, strengths, gain, resolution and background
 (`swarmsim.radiation.laplace`), so that what explains more spectra is not preferred for fitting one of them.
 Posterior = evidence x prior, where each bin's deviance is reduced to account for the error of the templates.
@@ -26,21 +27,23 @@ from swarmsim.radiation.pursuit import (
     Found,
     Sources,
     bin_weights,
+    known_strangers,
+    lines_of_strangers,
     natural_slopes,
     of_library,
     screen,
-    strangers,
     strengths,
     with_new,
 )
-from swarmsim.radiation.templates import Tables, shield_shares, tables
+from swarmsim.radiation.templates import Tables, shield_shares, stranger_shares, tables
 
 NONE, UNKNOWN = -1, -2
 """What `Identification.nuclide` is where no nuclide is named: background only, or a source not in the library."""
 CANDIDATES = 10  # sources that are fitted in full at each stage
 _SHIELDS_EACH = 3  # of one nuclide among them
 # Prior: a hotspot may be natural background, may be no nuclide of the library, and is rarely a mixture.
-_PRIOR_NONE, _PRIOR_UNKNOWN, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.1, 0.4, 0.08, 0.02
+_PRIOR_NONE, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.4, 0.08, 0.02
+_PRIOR_KNOWN, _PRIOR_LINES = 0.07, 0.03  # of a stranger that is known of, and of one that is not
 _BASE_SIZE = (0, 1, 1, 2)  # nuclides of the base of each stage
 _MODEL_ERROR = 0.015
 """Relative error of an expected spectrum in a bin, for the goodness of fit: an estimate."""
@@ -60,6 +63,8 @@ class Identification:
     width: jax.Array  # [] fitted width of peaks relative to the detector's
     goodness: jax.Array  # [] p-value of the deviance of the best hypothesis of the library
     fit: jax.Array  # [channels] expected counts of that hypothesis
+    stranger: jax.Array  # [] int32 index into the detector's ``known_names``: the likeliest one that is not looked for
+    alike: jax.Array  # [] probability that it is that one, if it is unknown
 
 
 class _Base(NamedTuple):
@@ -78,7 +83,15 @@ class _Stage(NamedTuple):
     best: _Base  # the best of them all
     share: jax.Array  # [2, N] counts of each nuclide of the base, and of any nuclide that is added, over all of both
     base_fit: Fit
-    strangers: jax.Array  # [] logarithm of the evidence of strangers
+
+
+class _Strangers(NamedTuple):
+    """What a source that is not looked for explains."""
+
+    known: jax.Array  # [] logarithm of the evidence of those that are known of
+    lines: jax.Array  # [] of lines of any energies
+    nuclide: jax.Array  # [] int32, the likeliest of the former
+    share: jax.Array  # [] of the evidence of the former that is its own
 
 
 def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identification:
@@ -91,6 +104,7 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
         raise InputError.of("a counter without energy resolution tells no nuclides apart: use a scintillator")
     n = len(detector.nuclide_names)
     table, data = tables(detector), binned_data(detector, counts, live_s)
+    strangers = _strangers(detector, table, data)
     stages = _stages(table, data, jnp.asarray(np.log(shield_shares(detector)), jnp.float32), n)
     prior = (
         _PRIOR_ONE / n,
@@ -98,7 +112,9 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
     )
     log_prior = np.log([p if n > k else 1e-30 for p, k in zip(prior, _BASE_SIZE, strict=True)])
     score = stages.score + log_prior[:, None]  # [stages, N]
-    none, unknown = stages.base_fit.score[0] + math.log(_PRIOR_NONE), stages.strangers[0] + math.log(_PRIOR_UNKNOWN)
+    none = stages.base_fit.score[0] + math.log(_PRIOR_NONE)
+    known, lines = strangers.known + math.log(_PRIOR_KNOWN), strangers.lines + math.log(_PRIOR_LINES)
+    unknown = jnp.logaddexp(known, lines)
     chance = jax.nn.softmax(jnp.concatenate([score.ravel(), jnp.stack([none, unknown])]))
     added, none_chance, unknown_chance = chance[:-2].reshape(score.shape), chance[-2], chance[-1]
     of_base = jnp.sum(added, axis=1)
@@ -127,27 +143,56 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
         width=jnp.sqrt(1.0 + 2.0 * best.time),
         goodness=p_value(data.counts, best.expected, data.certainty, fitted, _MODEL_ERROR),
         fit=_in_channels(detector, best.expected),
+        stranger=strangers.nuclide,
+        alike=strangers.share * jnp.exp(known - unknown),
     )
+
+
+def _strangers(detector: Detector, table: Tables, data: Data) -> _Strangers:
+    """Evidence of a source that is not looked for, alone on the background."""
+    weight = bin_weights(table, data)
+    expected, slope = _about(table, data, _nobody(), jnp.zeros(COLUMNS).at[0].set(data.natural))
+    found = screen(detector.known_spectrum, data, weight, expected, slope, _gain_prior())
+    chosen, shield_log_share = detector.stranger, np.log(stranger_shares(detector))
+    nuclide_log_share = jnp.log(jnp.maximum(chosen / jnp.maximum(jnp.sum(chosen), 1.0), 1e-30))
+    prior = (nuclide_log_share[:, None] + shield_log_share).ravel()
+    known = known_strangers(table, data, found, detector.known_spectrum, detector.known_scattered, prior)
+    lines = lines_of_strangers(table, data, weight, natural_slopes(table, data), found.base_gain)
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), known, lines)
+    fits = jax.vmap(jax.vmap(lambda hypothesis: laplace(hypothesis, data)))(both.hypotheses)
+    fitted = fits.score + both.places
+    # what is not fitted is off by as much as what is
+    evidence = both.total + logsumexp(fitted, axis=1) - logsumexp(both.score, axis=1)
+    nuclide = known.row[jnp.argmax(fitted[0])] // len(shield_log_share)
+    own = logsumexp((found.score + prior).reshape(-1, len(shield_log_share))[nuclide]) - known.total
+    return _Strangers(evidence[0], evidence[1], nuclide.astype(jnp.int32), jnp.exp(own))
+
+
+def _nobody() -> Sources:
+    return Sources(jnp.zeros(SOURCES, jnp.int32), jnp.zeros(SOURCES), jnp.zeros(SOURCES))
+
+
+def _gain_prior() -> jax.Array:
+    return -0.5 * ((jnp.asarray(GAINS) - 1.0) / GAIN_STD) ** 2
+
+
+def _about(table: Tables, data: Data, own: Sources, counts: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What sources and background of ``counts`` [COLUMNS] expect [gains, bins]; its slopes [gains, COLUMNS, bins]."""
+    about = jax.vmap(lambda gain: of_library(table, data, own, gain))(jnp.arange(len(GAINS)))
+    shape = about.column[:, :, 0]  # [gains, COLUMNS, bins]
+    return jnp.einsum("c,gcb->gb", counts, shape), about.scale[..., None] * shape
 
 
 def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stage:
     """All stages: one nuclide; another with the best; another with that one alone; a third with the best two."""
     shields = table.sources.shape[0] // n
-    weight, slopes = bin_weights(table, data), natural_slopes(table, data)
+    weight = bin_weights(table, data)
     row_prior = jnp.tile(shield_prior, n)
-    gains = jnp.arange(len(GAINS))
-    gain_prior = -0.5 * ((jnp.asarray(GAINS) - 1.0) / GAIN_STD) ** 2
-    nobody = Sources(jnp.zeros(SOURCES, jnp.int32), jnp.zeros(SOURCES), jnp.zeros(SOURCES))
 
     def added_to(own: Sources, counts: jax.Array) -> Found:
         """Candidates at all gains, whose amplitudes follow; ``counts`` [COLUMNS] are those of the base."""
-        about = jax.vmap(lambda gain: of_library(table, data, own, gain))(gains)
-        shape = about.column[:, :, 0]  # [gains, COLUMNS, bins]
-        slope = about.scale[..., None] * shape
-        return screen(table, data, weight, jnp.einsum("c,gcb->gb", counts, shape), slope, gain_prior)
-
-    alone = jnp.zeros(COLUMNS).at[0].set(data.natural)
-    other = strangers(table, data, weight, slopes, added_to(nobody, alone).base_gain)
+        expected, slope = _about(table, data, own, counts)
+        return screen(table.sources[:, :, 0], data, weight, expected, slope, _gain_prior())
 
     def stage(bases: _Base, k: jax.Array) -> tuple[_Base, _Stage]:
         base = jax.tree.map(lambda leaf: leaf[k], bases)
@@ -167,7 +212,6 @@ def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stag
         hypotheses = [
             jax.vmap(lambda s, g: of_library(table, data, s, g))(candidates, jnp.clip(at, 0, len(GAINS) - 1)),
             jax.tree.map(lambda leaf: leaf[None], of_library(table, data, own, found.base_gain)),
-            other.hypotheses,
         ]
         fits = jax.vmap(lambda h: laplace(h, data))(jax.tree.map(lambda *a: jnp.concatenate(a), *hypotheses))
         many, first_many = row.shape[0], few.shape[0]
@@ -185,15 +229,12 @@ def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stag
         counts /= jnp.maximum(jnp.sum(counts), 1e-9)
         new = counts[size]
         old = jnp.zeros(n).at[base.sources.row // shields].add(counts * base.sources.present)
-        stranger_score = fits.score[many + 1 :] + other.places
-        extra = logsumexp(stranger_score) - logsumexp(other.score)
         out = _Stage(
             score=evidence + base.log_prior,
             base=in_base,
             best=winner,
             share=jnp.stack([old, jnp.full(n, new)]),
             base_fit=jax.tree.map(lambda leaf: leaf[many], fits),
-            strangers=other.total + extra,
         )
         better = (k == 1) | (winner.fit.score + winner.log_prior > bases.fit.score[3] + bases.log_prior[3])
         # the nuclide that was added to the first one, alone: so that the first one's shield is found again beside it
@@ -212,8 +253,8 @@ def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stag
         return bases, out
 
     bins = data.counts.shape[0]
-    zero = jnp.zeros(())
-    empty = _Base(nobody, Fit(zero, alone, zero + 1.0, zero, jnp.zeros(bins)), zero)
+    zero, alone = jnp.zeros(()), jnp.zeros(COLUMNS).at[0].set(data.natural)
+    empty = _Base(_nobody(), Fit(zero, alone, zero + 1.0, zero, jnp.zeros(bins)), zero)
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (5, *leaf.shape)), empty)
     return jax.lax.scan(stage, start, jnp.arange(len(_BASE_SIZE)))[1]
 

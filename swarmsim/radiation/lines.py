@@ -19,6 +19,8 @@ SPECTRUM_DEPTHS = (1.0, 5.0)
 """Mean free paths for which the energies of scattered photons are tabulated."""
 SHIELDS = ("water", "concrete", "steel", "lead")
 """Walls of the templates of identification: what others let through lies between."""
+DEPTHS = (0.4, 1.1, 1.9, 2.9, 4.1)
+"""Optical depths of these walls, for all photons of a nuclide together. The least stops X-rays and little else."""
 LINE_DEPTHS = (1.0, 3.0)
 """Mean free paths behind which single lines are tabulated."""
 GROUND = 0.7

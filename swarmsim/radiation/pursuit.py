@@ -58,12 +58,13 @@ class Found(NamedTuple):
 
 
 class Strangers(NamedTuple):
-    """Hypotheses of a source that the library lacks."""
+    """Hypotheses of a source that is not looked for."""
 
     hypotheses: Hypothesis  # [STRANGERS]
     score: jax.Array  # [STRANGERS] logarithm of the evidence, to second order
     places: jax.Array  # [STRANGERS] logarithm of the prior and the number of energies that explain the lines as well
     total: jax.Array  # [] logarithm of the evidence of all strangers, to second order
+    row: jax.Array  # [STRANGERS] int32, nuclide and shield where they are known of
 
 
 def bin_weights(tables: Tables, data: Data) -> jax.Array:
@@ -83,9 +84,9 @@ def natural_slopes(tables: Tables, data: Data) -> jax.Array:
 
 
 def screen(
-    tables: Tables, data: Data, weight: jax.Array, expected: jax.Array, slope: jax.Array, gains: jax.Array
+    shapes: jax.Array, data: Data, weight: jax.Array, expected: jax.Array, slope: jax.Array, gains: jax.Array
 ) -> Found:
-    """Rank all rows as a source added to a hypothesis that at each gain expects ``expected`` [gains, bins].
+    """Rank spectra [rows, gains, bins] as a source added to what at each gain expects ``expected`` [gains, bins].
 
     ``slope`` [gains, V, bins] are its slopes by its parameters in units of their prior, ``gains`` [gains] the logarithm
     of the prior of each gain.
@@ -98,7 +99,7 @@ def screen(
         return value + base + prior, strength, base + prior
 
     score, strength, base = jax.vmap(at, in_axes=(1, 0, 0, 0))(
-        tables.sources[:, :, 0],
+        shapes,
         jnp.broadcast_to(expected, (len(GAINS), data.counts.shape[0])),
         jnp.broadcast_to(slope, (len(GAINS), *slope.shape[-2:])),
         gains,
@@ -170,7 +171,7 @@ def _hypothesis(
     )
 
 
-def strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax.Array, gain: jax.Array) -> Strangers:
+def lines_of_strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax.Array, gain: jax.Array) -> Strangers:
     """The lines that explain the spectrum best, behind every shield; the background is linear about a gain [] int32.
 
     Lines are added one by one where they raise the evidence (orthogonal matching pursuit: Pati, Rezaiifar and
@@ -217,6 +218,33 @@ def strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax.Array, g
         score=score[shield],
         places=places[shield] - np.log(shields),
         total=logsumexp(score),
+        row=shield,
+    )
+
+
+def known_strangers(
+    tables: Tables, data: Data, found: Found, known: jax.Array, scattered: jax.Array, prior: jax.Array
+) -> Strangers:
+    """The nuclides among those that are not looked for which explain the spectrum best, each behind some shield.
+
+    ``found`` ranks their spectra ``known`` [rows, gains, bins], of which ``scattered`` [rows, bins] is the part of
+    scattered photons; ``prior`` [rows] is the logarithm of their prior.
+    """
+    ranked = found.score + prior
+    score, row = jax.lax.top_k(ranked, STRANGERS)
+    bins = data.counts.shape[0]
+
+    def hypothesis(row: jax.Array) -> Hypothesis:
+        gain, extra = found.gain[row], COLUMNS - NATURAL - PARTS
+        column = jnp.zeros((COLUMNS - NATURAL, ORDERS, bins))
+        column = column.at[:PARTS, 0].set(jnp.stack([known[row, gain], scattered[row]]))
+        about = jnp.maximum(found.strength[row], 0.02 * data.natural)
+        scale = jnp.pad(about * jnp.array([1.0, PART_STD]), (0, extra))
+        start = jnp.pad(found.strength[row][None], (0, extra + PARTS - 1))
+        return _hypothesis(tables, data, column, scale, jnp.zeros(COLUMNS - NATURAL).at[0].set(1.0), start, gain)
+
+    return Strangers(
+        hypotheses=jax.vmap(hypothesis)(row), score=score, places=prior[row], total=logsumexp(ranked), row=row
     )
 
 

@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 
 from swarmsim.radiation.cylinder import direction_basis
 from swarmsim.radiation.detector import AIR, Detector
-from swarmsim.radiation.lines import GROUND, SHIELDS
+from swarmsim.radiation.lines import DEPTHS, GROUND, SHIELDS
 from swarmsim.radiation.rate import from_ground, scattered_shares, transmission
+from swarmsim.radiation.strangers import shield_count
 from swarmsim.site.rays import Crossed, Shape
 
-DEPTHS = (0.4, 1.1, 1.9, 2.9, 4.1)
-"""Optical depths of the shields of the templates. The least stops the X-rays and little else."""
 AIR_M = (60.0,)
 """Lengths of the ways in air of the templates."""
 _BARE_SHARE, _GROUND_SHARE, _AIR_SHARE = 0.2, 0.2, 0.1  # of the prior of the shields; all walls share the rest
@@ -52,6 +51,14 @@ def shield_shares(detector: Detector) -> NDArray[np.float64]:
     walls = 1.0 - _BARE_SHARE - _GROUND_SHARE - _AIR_SHARE
     share = walls * wall / wall.sum() + _AIR_SHARE * air / max(air.sum(), 1) + _GROUND_SHARE * ground
     share[0] = _BARE_SHARE
+    return np.asarray(share / share.sum())
+
+
+def stranger_shares(detector: Detector) -> NDArray[np.float64]:
+    """Prior [shields] of each shield of `swarmsim.radiation.strangers`, which has no shield of air alone."""
+    share = np.full(shield_count(detector.material_names), 1.0)
+    share[2:] *= (1.0 - _BARE_SHARE - _GROUND_SHARE) / max(len(share) - 2, 1)
+    share[:2] = _BARE_SHARE, _GROUND_SHARE
     return np.asarray(share / share.sum())
 
 

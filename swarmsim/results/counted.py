@@ -126,4 +126,5 @@ def _spectrum(table: pa.Table) -> Spectrum:
         confidence=float(metadata["confidence"]),
         scores={},
         detector=metadata["detector"],
+        begin_s=float(metadata.get("begin_s", 0.0)),
     )

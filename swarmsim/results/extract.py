@@ -252,6 +252,7 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
         lines_kev=np.array([line.energy_kev for line in lines]),
         detector=detector_models(simulation.scenario)[model],
+        begin_s=max(float(conclusion.spectrum.begin_s), 0.0),
     )
 
 

@@ -40,6 +40,7 @@ _DOSE = (
     "energy resolution: from its counts, calibrated to Cs-137), background included."
 )
 _NO_SPECTRA = "The detector resolves no energies: there are counts alone, and no spectra."
+_IDEALISED = "Counts of this idealised detector stand for the time told, which is longer than between two measurements."
 _SPECTRA = "Spectra of samples were drawn after the flight: their sums over the energy windows are the counts recorded."
 
 
@@ -134,6 +135,7 @@ def _write_vehicle(
     samples = counted.samples.rows(counted.samples.vehicle == number) if spectra is None else spectra.samples
     meaning, located = places_of(simulation.site_model.report)
     remarks = [meaning, _DOSE, _NO_SPECTRA if spectra is None else _SPECTRA]
+    remarks += [_IDEALISED] if simulation.scenario.mission.detection == "paper_ideal" else []
     vehicle = simulation.scenario.members[number].type
     uuid = _uuid(counted.name, counted.seed, name, start, samples.time_s, samples.position_m, samples.counts)
     with n42.document(path, uuid) as file:
@@ -196,7 +198,7 @@ def _write_spectrum(simulation: Simulation, counted: Counted, spectrum: Spectrum
         "source, and drawn by itself, so that its total differs from theirs by statistics."
     )
     background = n42.element("ChannelData", n42.numbers(spectrum.background))
-    begin = n42.moment(start, 0.0)
+    begin = n42.moment(start, spectrum.begin_s)
     with n42.document(path, _uuid(counted.name, counted.seed, SPECTRUM, start, spectrum.counts)) as file:
         n42.write(file, _heading(counted, start, [remark]))
         n42.write(

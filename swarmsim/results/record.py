@@ -136,6 +136,7 @@ class Spectrum:
     unknown: float = 0.0  # probability of a source that no nuclides of the library explain
     goodness: float = 1.0  # p-value of the deviance of the fit
     detector: str = ""  # model that took it
+    begin_s: float = 0.0  # when its first sample began
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,7 @@ def spectrum_table(record: MissionRecord, spectrum: Spectrum) -> pa.Table:
     }
     told = {
         "live_time_s": repr(float(spectrum.live_time_s)),
+        "begin_s": repr(float(spectrum.begin_s)),
         "detector": spectrum.detector,
         "nuclide": spectrum.nuclide,
         "confidence": repr(float(spectrum.confidence)),
