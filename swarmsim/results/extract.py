@@ -34,6 +34,7 @@ from swarmsim.world.build import detector_models
 
 LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
 """Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
+LIKELY = 0.5  # a stranger is told that the source rather is than not
 UNNAMED = {NONE: "none", UNKNOWN: "unknown"}
 """What a spectrum is said to show where no nuclide is named."""
 CROWDED = "more vehicles were in one place than the neighbour search holds: a collision may have gone unnoticed"
@@ -253,6 +254,7 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         lines_kev=np.array([line.energy_kev for line in lines]),
         detector=detector_models(simulation.scenario)[model],
         begin_s=max(float(conclusion.spectrum.begin_s), 0.0),
+        alike=detector.known_names[int(answer.stranger)] if index == UNKNOWN and float(answer.alike) > LIKELY else "",
     )
 
 

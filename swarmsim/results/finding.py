@@ -59,7 +59,8 @@ def _identified(estimate: Estimate, spectrum: Spectrum, by: str) -> str:
     if spectrum.nuclide == "none":
         return f"{by}, the spectrum shows none"
     if spectrum.nuclide == "unknown":
-        return f"{by}, the spectrum is of none in the library with {spectrum.confidence:.0%}"
+        alike = f", most like {spectrum.alike}" if spectrum.alike else ""
+        return f"{by}, the spectrum is of none in the library with {spectrum.confidence:.0%}{alike}"
     said = f"identified with {spectrum.confidence:.1%}"
     if spectrum.nuclide != estimate.nuclide:
         said = f"{by}, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
