@@ -16,8 +16,9 @@ from swarmsim.pytree import pytree, static
 from swarmsim.radiation import Detector, Source, net_rate, observed_rate
 from swarmsim.radiation.background import fall_with_height
 from swarmsim.site import Site, sample, sample_with_gradient
-from swarmsim.site.rays import BLOCK, crossed_from
+from swarmsim.site.rays import crossed_from
 
+BLOCK = 1024  # rays of a block of measurements; one without a valid measurement costs nothing
 STEP_SHARE = 0.05  # step of the central differences over the distance of the nearest window: a relative error of 0.25 %
 STEP_M = (0.02, 1.0)  # shortest and longest step
 MEAN_FLOOR = 1e-6  # counts; keeps a zero-rate model finite when it meets a count

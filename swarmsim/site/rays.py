@@ -14,8 +14,9 @@ from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site, sample
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
-BLOCK = 1024  # segments intersected with all boxes at a time, so that the result fits the cache
-VECTOR = 8  # boxes are padded to a multiple of this SIMD width, with empty boxes
+NEIGHBOURS = 32  # segments that are intersected with the same clusters of boxes
+CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
+_TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
 _PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is parallel to the slab
 
 
@@ -123,15 +124,82 @@ def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
 
 
 def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
-    """In blocks that fit the cache, the boxes as the vectorised axis."""
-    n, above = b.shape[0], above_of(site)
-    rows = -site.obstacles.wall_m.shape[0] % VECTOR
-    boxes = jax.tree.map(lambda x: jnp.pad(x, [(0, rows)] + [(0, 0)] * (x.ndim - 1)), site.obstacles)
-    padded = replace(site, obstacles=boxes)
-    size = min(BLOCK, n)
+    """In blocks of neighbouring ends; clusters of boxes that none of a block's segments comes near are left out.
+
+    Within a cluster the boxes are the vectorised axis.
+    """
+    n, above, clusters = b.shape[0], above_of(site), _clusters(site.obstacles)
+    size = min(NEIGHBOURS, n)
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
-    found = jax.lax.map(jax.vmap(lambda end: _crossed(padded, above, a, end)), ends)
+
+    def block(ends: jax.Array) -> Crossed:
+        near = jax.lax.map(lambda boxes: jnp.any(_near(boxes, a, ends)), clusters)
+
+        def of_clusters(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
+            def add(found: _Found, cluster: tuple[Obstacles, jax.Array]) -> tuple[_Found, None]:
+                def met(found: _Found) -> _Found:
+                    own = _all_boxes(replace(site, obstacles=cluster[0]), a, direction, distance)
+                    own = replace(own, narrow=jnp.sum(own.narrow), closed=jnp.sum(own.closed))
+                    return jax.tree.map(jnp.add, found, own)
+
+                return jax.lax.cond(cluster[1], met, lambda found: found, found), None
+
+            zero, one = jnp.zeros(len(site.material_names)), jnp.zeros(())
+            nothing = _Found(share=zero, moment=zero, thin=zero, narrow=one, closed=one)
+            return jax.lax.scan(add, nothing, (clusters, near))[0]
+
+        return jax.vmap(lambda end: _crossed(site, above, a, end, of_clusters))(ends)
+
+    found = jax.lax.map(block, ends)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
+
+
+def _clusters(boxes: Obstacles) -> Obstacles:
+    """Boxes [C, `CLUSTER`] in clusters of near ones: along a Z-order curve of 1024 x 1024 cells (Morton 1966)."""
+    low, high = jnp.min(boxes.centre_m, axis=0), jnp.max(boxes.centre_m, axis=0)
+    cell = ((boxes.centre_m - low) / jnp.maximum(high - low, 1e-6) * 1023.0)[:, :2].astype(jnp.uint32)
+    for shift, mask in ((8, 0x00FF00FF), (4, 0x0F0F0F0F), (2, 0x33333333), (1, 0x55555555)):
+        cell = (cell | (cell << shift)) & mask
+    order = jnp.argsort(cell[:, 0] | (cell[:, 1] << 1))
+    rows = -len(order) % CLUSTER
+
+    def clustered(leaf: jax.Array) -> jax.Array:
+        padded = jnp.pad(leaf[order], [(0, rows)] + [(0, 0)] * (leaf.ndim - 1))
+        return padded.reshape(-1, CLUSTER, *leaf.shape[1:])
+
+    return jax.tree.map(clustered, boxes)
+
+
+def _near(boxes: Obstacles, a: jax.Array, ends: jax.Array) -> jax.Array:
+    """Whether any segment from ``a`` [3] to ``ends`` [n, 3] may meet each box [K].
+
+    A point at the share s of one of them is no farther than s D from that of the segment to the ends' middle, D being
+    how far they lie around it: that segment is tested against a box so much larger.
+    """
+    middle = 0.5 * (jnp.min(ends, axis=0) + jnp.max(ends, axis=0))
+    around = jnp.sqrt(jnp.max(jnp.sum(jnp.square(ends - middle), axis=1)))
+    direction = middle - a
+    length = jnp.sqrt(jnp.sum(direction * direction))
+    offset = boxes.centre_m - a
+    share = jnp.clip(offset @ direction / jnp.maximum(length * length, 1e-9), 0.0, 1.0)
+    radius = jnp.sqrt(jnp.sum(boxes.half_extent_m**2, axis=1))
+    # where it meets the box, at s: (s - share) length <= radius + s around
+    last = jnp.where(length > around, (radius + share * length) / jnp.maximum(length - around, 1e-6), 1.0)
+    larger = boxes.half_extent_m + (around * jnp.minimum(last, 1.0) + _TOUCH_M)[:, None]
+    start, along = _in_axes(boxes, -offset), _in_axes(boxes, direction)
+    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
+    reach = [jnp.abs(i) * larger[:, k] for k, i in enumerate(inverse)]
+    middles = [-x * i for x, i in zip(start, inverse, strict=True)]
+    enter = jnp.maximum(_most([m - r for m, r in zip(middles, reach, strict=True)]), 0.0)
+    leave = jnp.minimum(_least([m + r for m, r in zip(middles, reach, strict=True)]), 1.0)
+    return (leave >= enter) & (radius > 0.0)
+
+
+def _in_axes(boxes: Obstacles, vector: jax.Array) -> list[jax.Array]:
+    """Components [K] of ``vector`` [3] or [K, 3] along the axes of each box."""
+    c, s = boxes.axis[:, 0], boxes.axis[:, 1]
+    x, y, z = (vector[..., k] for k in range(3))
+    return [c * x + s * y, c * y - s * x, jnp.broadcast_to(z, c.shape)]
 
 
 def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = None) -> Crossed:
@@ -197,14 +265,7 @@ def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax
 
 def _of_boxes(obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
     """What the segment crosses of each box [K]. Written per component, so that the boxes are the vectorised axis."""
-    offset = a - obstacles.centre_m
-    c, s = obstacles.axis[:, 0], obstacles.axis[:, 1]
-    start = (c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2])
-    along = (
-        c * direction[0] + s * direction[1],
-        c * direction[1] - s * direction[0],
-        jnp.broadcast_to(direction[2], c.shape),
-    )
+    start, along = _in_axes(obstacles, a - obstacles.centre_m), _in_axes(obstacles, direction)
     # Clamp a component that is too small to divide by: the slab then extends far beyond the segment.
     inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
     middle = [-x * i for x, i in zip(start, inverse, strict=True)]

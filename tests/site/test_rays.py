@@ -186,6 +186,40 @@ def test_a_thread_for_each_segment_crosses_the_same():
     assert 0.0 <= float(expected.shape.spread.min()) < 0.5
 
 
+@pytest.mark.parametrize("together", ["on lines", "anywhere"])
+def test_clusters_that_are_left_out_are_not_crossed(together):
+    """Many boxes, thin and long, hollow and solid, from places within and beside them: as of each segment alone."""
+    rng = np.random.default_rng(7)
+    site = make_site([
+        ((*rng.uniform(-60.0, 60.0, 2), rng.uniform(0.0, 8.0)),
+         10.0 ** rng.uniform(-1.3, 1.2, 3) * (1.0, 1.0, 0.3), rng.uniform(-3.0, 3.0), wall, "concrete")
+        for wall in rng.choice([0.0, 0.0, 0.05, 0.2], 150)
+    ])  # fmt: skip
+    starts = np.c_[rng.uniform(-70.0, 70.0, (12, 2)), rng.uniform(0.2, 20.0, 12)]
+    starts[:4] = site.obstacles.centre_m[:4]
+    if together == "on lines":
+        x, y = np.meshgrid(np.arange(-70.0, 70.0, 5.0), np.arange(-70.0, 71.0, 14.0))
+        ends = np.c_[x.ravel(), y.ravel(), np.where(y.ravel() > 40.0, 0.5, 18.0)]
+    else:
+        ends = np.c_[rng.uniform(-70.0, 70.0, (300, 2)), 10.0 ** rng.uniform(-1.0, 1.5, 300)]
+    ends[:3] = starts[:3]
+    starts, ends = jnp.asarray(starts, jnp.float32), jnp.asarray(ends, jnp.float32)
+
+    def rises(way):
+        """Lengths, and their derivatives towards the north-east."""
+        return jax.jvp(lambda a: way(a).length_m, (jnp.zeros(3),), (jnp.array([1.0, 1.0, 0.0]),))
+
+    both = jax.jit(lambda: jax.lax.map(lambda a: rises(lambda d: crossed_from(site, a + d, ends)), starts))()
+    alone = jax.jit(
+        lambda: jax.vmap(lambda a: rises(lambda d: jax.vmap(lambda b: crossed(site, a + d, b))(ends)))(starts)
+    )()
+    np.testing.assert_allclose(both[0], alone[0], atol=1e-4)
+    np.testing.assert_allclose(both[1], alone[1], atol=2e-3 * float(jnp.max(jnp.abs(alone[1]))))
+    assert float(jnp.max(both[0][..., CONCRETE])) > 5.0
+    crosses = jnp.mean(both[0][..., CONCRETE] > 0.0)
+    assert 0.1 < float(crosses) < 1.0
+
+
 def shape_of(site, a, b):
     way = crossed_of(site, jnp.array(a, jnp.float32), jnp.array(b, jnp.float32))
     return float(way.length_m[CONCRETE]), float(way.shape.thin_m[CONCRETE]), way.shape
