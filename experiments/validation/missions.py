@@ -54,8 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     records = [swarmsim.mission_record(simulation, batch, i) for i in range(options.missions)]
     mission = simulation.scenario.mission
     assert mission.localisation is not None
-    least = mission.localisation.detection_sigma**2
-    asked = (least, least / mission.knowledge.learning_rate)
+    asked = (mission.localisation.detection_sigma**2, mission.localisation.further_sigma**2)
     rows = [row for record, seen in zip(records, detectable, strict=True) for row in rows_of(record, seen, asked)]
     summary = summarised(records, rows) | {"clock_s": {name: round(s, 2) for name, s in batch.clock.ran.items()}}
     options.out.mkdir(parents=True, exist_ok=True)

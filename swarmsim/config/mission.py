@@ -131,10 +131,10 @@ class Localisation(Model):
     """Estimate of the sources' number, places and activities from the likelihood of the counts.
 
     A source is one where twice the logarithm of the likelihood ratio exceeds the square of ``detection_sigma``; beside
-    another one it counts ``knowledge.learning_rate`` times. Sources are looked for at points ``grid_m`` apart, then
-    within ``search_radius_m`` of the best of them, then in ``search_rounds`` rounds, each about half as far as the one
-    before. The posterior of each is that of at most ``sample_rounds`` times ``samples`` places. ``rays_per_window``
-    lead to each window along its way, which walls' shadows may cross.
+    another one, whose errors of the model look like further sources, that of ``further_sigma``. Sources are looked for
+    at points ``grid_m`` apart, then within ``search_radius_m`` of the best of them, then in ``search_rounds`` rounds,
+    each about half as far as the one before. The posterior of each is that of at most ``sample_rounds`` times
+    ``samples`` places. ``rays_per_window`` lead to each window along its way, which walls' shadows may cross.
     """
 
     presumed_height_m: float = Field(ge=-5, le=100)
@@ -143,6 +143,7 @@ class Localisation(Model):
     rays_per_window: int = Field(default=3, ge=1, le=32)
     sources_max: int = Field(default=4, ge=1, le=8)
     detection_sigma: float = Field(default=5.5, ge=1, le=100)
+    further_sigma: float = Field(default=7.8, ge=1, le=100)
     grid_m: float = Field(default=4.0, ge=0.1, le=1000)
     search_radius_m: float = Field(default=6.0, ge=0.01, le=1000)
     search_rounds: int = Field(default=7, ge=1, le=100)

@@ -101,6 +101,7 @@ def localisation_params(spec: Localisation) -> LocalisationParams:
     return LocalisationParams(
         search=SearchParams(
             threshold=on_host(spec.detection_sigma**2),
+            further=on_host(spec.further_sigma**2),
             reach_m=on_host(spec.search_radius_m),
             grid_m=on_host(spec.grid_m),
             rounds=spec.search_rounds,

@@ -40,6 +40,7 @@ class SearchParams:
     """Settings of the search for sources."""
 
     threshold: jax.Array  # [] twice the logarithm of the likelihood ratio that a source must reach
+    further: jax.Array  # [] the same of a source beside others, whose errors of the model look like further sources
     reach_m: jax.Array  # [] of the search around the best of the grid points
     grid_m: jax.Array  # [] from one grid point to the next
     rounds: int = static()  # that close in
@@ -159,7 +160,7 @@ def find_sources(
         wide = p.wide & jnp.any(again) & ~adding
         p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
         untried = done & ~p.trial & (jnp.sum(present) >= 2)
-        p = _ended_trial(_further(problem, params), p, done & p.trial)
+        p = _ended_trial(params.further, p, done & p.trial)
         p = _begun_trial(problem, params, p, untried)
         full = jnp.all(p.state.sources.present) & ~jnp.any(p.again)
         return replace(p, over=p.over | full | (p.left <= 0))
@@ -180,16 +181,11 @@ def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.
         ratio = jnp.where(s.present, ratios(problem, p.state), jnp.inf)
         k = jnp.argmin(ratio)
         less = replace(p, state=settled(problem, without(p.state, k)), before=p.state)
-        least = _further(problem, params)
+        least = params.further
         less = replace(less, trial=ratio[k] >= least, again=less.state.sources.present)
         return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * least), less, p)
 
     return either(now, begin, lambda: p)
-
-
-def _further(problem: Problem, params: SearchParams) -> jax.Array:
-    """Statistic [] that a source beside others must reach: errors of the model of those look like further sources."""
-    return params.threshold / problem.learning_rate
 
 
 def _ended_trial(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
@@ -224,7 +220,7 @@ def _sought(
     def look() -> tuple[State, jax.Array]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
-        found = ~adding | (ratio > jnp.where(jnp.any(s.present), _further(problem, params), params.threshold))
+        found = ~adding | (ratio > jnp.where(jnp.any(s.present), params.further, params.threshold))
         after = _with(problem, state, slot, best)
         kept = jnp.where(adding | wide, values, s.nuclide_value[slot])
         table = after.sources.nuclide_value.at[slot].set(kept)
