@@ -1,17 +1,26 @@
 """The commands: thin, and quick to start. What they need is imported when they run."""
 
+from collections.abc import Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from cyclopts import App, Parameter
+from cyclopts import App, Parameter, Token
 from cyclopts.validators import Number
 
 SEED_END = 2**31
 
 Kind = Literal["vehicles", "sites", "missions", "detectors", "nuclides", "materials", "policies"]
 ModelKind = Literal["mission", "vehicle", "site", "detector", "nuclide", "material"]
+
+
+def _whole(_: object, tokens: Sequence[Token]) -> int:
+    """A whole number; cyclopts alone would round another one."""
+    text = tokens[0].value
+    if not text.lstrip("+-").isdecimal():
+        raise ValueError(f"a whole number is needed, not '{text[:100]}'")
+    return int(text[:100])
 
 
 def _version() -> str:
@@ -53,8 +62,8 @@ def run(
     scenario: str,
     *,
     out: Path | None = None,
-    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END))] = None,
-    missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1_000_000))] = 1,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END), converter=_whole)] = None,
+    missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1_000_000), converter=_whole)] = 1,
     overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
     force: bool = False,
     strict: bool = False,
@@ -179,8 +188,8 @@ def check(*paths: Path) -> None:
 def draw(
     scenario: str,
     *,
-    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END))] = None,
-    missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1000))] = 4,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END), converter=_whole)] = None,
+    missions: Annotated[int, Parameter(validator=Number(gte=1, lte=1000), converter=_whole)] = 4,
     overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
 ) -> None:
     """Show what missions of a family draw (`vary` of a mission file), without flying them.

@@ -2,6 +2,7 @@
 
 import atexit
 import gc
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -19,6 +20,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Wrong input is told on standard error without a traceback; an error of swarmsim itself keeps its traceback.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # so that a file or a pipe shows how far a run is
     atexit.register(gc.freeze)  # the interpreter's last collection of garbage would take another second
     try:
         os.getcwd()

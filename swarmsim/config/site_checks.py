@@ -117,7 +117,7 @@ def _check_fence(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
         stop = float(stopping_m(jnp.float32(own.speed_m_s), brake))
         onward = stop * np.array([math.cos(sweep), math.sin(sweep)])
         ends, ahead = np.concatenate([first, last]), np.concatenate([first - onward, last + onward])
-        low, high = ground.low + fence.margin_m, ground.high - fence.margin_m
+        low, high = ground.fence(fence.margin_m)
         beyond = np.max(np.maximum(low - ahead, ahead - high), axis=1)
         worst = int(np.argmax(beyond))
         if beyond[worst] > ROUNDING_M:

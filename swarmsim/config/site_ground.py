@@ -42,6 +42,10 @@ class Ground:
         (west, south), (east, north) = self.low, self.high
         return f"x from {west:g} to {east:g}, y from {south:g} to {north:g}"
 
+    def fence(self, margin_m: float) -> tuple[Floats, Floats]:
+        """South-west and north-east corner [2] of the fence: the middles of the outermost cells, less the margin."""
+        return self.low + 0.5 * self.cell + margin_m, self.high - 0.5 * self.cell - margin_m
+
     def holds(self, xy: Floats) -> bool:
         """Whether ``xy`` [2] lies on the site."""
         return bool(np.all(xy >= self.low) and np.all(xy <= self.high))

@@ -65,6 +65,14 @@ def _start_fault(scenario: Scenario, ground: Ground, i: int, xy: Floats) -> tupl
     radius = footprint_radius_m(vehicle)
     if not ground.holds(xy):
         return "outside the site", {"allowed": ground.extent}
+    fence = scenario.mission.failsafes.fence
+    if isinstance(vehicle, Multirotor) and fence.action != "none":
+        low, high = ground.fence(fence.margin_m)
+        if np.any(xy < low) or np.any(xy > high):
+            (west, south), (east, north) = low, high
+            return "outside the fence, which is the site's outline less failsafes.fence.margin_m", {
+                "allowed": f"x from {west:g} to {east:g}, y from {south:g} to {north:g}"
+            }
     height = vehicle.chassis_height_m if isinstance(vehicle, SkidSteer) else vehicle.collision_height_m
     depth = ground.depth(np.array([*xy, ground.cell_value(ground.terrain, xy) + height / 2]))
     touching = np.flatnonzero((depth[:, :2].min(axis=1) > -radius) & (depth[:, 2] > -height / 2))

@@ -33,9 +33,10 @@ class Draws:
     values: Mapping[str, Sequence[Any]]  # [B] each
     family: tuple[Varied, ...]
     regions: tuple[Mapping[str, Region], ...]  # [B] of the sources that are placed by region, by their paths
+    given: tuple[str, ...] = ()  # paths that the family does not draw, whose values were given
 
     def told(self, index: int) -> Row:
-        """What mission ``index`` drew, by path, of the sources that are there; and their number and regions."""
+        """What mission ``index`` drew or was given, by path, of the sources that are there; also their number."""
         row = {path: each[index] for path, each in self.values.items()}
         there: dict[int, bool] = {}
         if any(varied.distribution.count is not None for varied in self.family):
@@ -48,7 +49,7 @@ class Draws:
             found[varied.path] = row[varied.path]
             if region := self.regions[index].get(varied.path):
                 found[f"{varied.path.rpartition('.')[0]}.region"] = region
-        return found
+        return found | {path: row[path] for path in self.given}
 
 
 def _source(place: Place) -> int:
@@ -204,7 +205,8 @@ _WANTED: dict[Region, str] = {
 def with_given(draws: Draws, given: Mapping[str, Sequence[Any]]) -> Draws:
     """The draws with ``given`` values in their stead, which no region is known of."""
     regions = tuple({path: each for path, each in found.items() if path not in given} for found in draws.regions)
-    return replace(draws, values={**draws.values, **given}, regions=regions)
+    own = tuple(path for path in given if path not in draws.values)
+    return replace(draws, values={**draws.values, **given}, regions=regions, given=own)
 
 
 def _nuclides(scenario: Scenario, varied: Varied) -> tuple[str, ...]:

@@ -264,4 +264,7 @@ def _in_channels(detector: Detector, expected: jax.Array) -> jax.Array:
     edges = np.asarray(detector.identification_bins)
     channel = np.arange(detector.energy_kev.shape[0])
     per_channel = jnp.interp(channel + 0.5, 0.5 * (edges[1:] + edges[:-1]), expected / np.diff(edges))
-    return jnp.where(channel < edges[0], 0.0, per_channel)
+    # the channel that the threshold lies in counts, but is in no bin: its share is that of the background there
+    natural = detector.background_spectrum
+    share = natural / jnp.maximum(natural[edges[0]], 1e-30)
+    return jnp.where(channel < edges[0], share * per_channel[edges[0]], per_channel)

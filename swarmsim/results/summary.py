@@ -218,17 +218,21 @@ def _true_dose(record: MissionRecord, source: TrueSource) -> dict[str, float]:
     }
 
 
+SURE_SIGMA = 2.0  # standard deviations by which a dose rate is at least as great
+
+
 def dose_summary(record: MissionRecord) -> dict[str, Any] | None:
     """The greatest dose rate that a detector showed, by its counts, and where; None where none is recorded.
 
-    Natural background is included. Of many readings the greatest one lies above the truth by about its statistical
-    standard deviation, which leaves out the error of the conversion (see `swarmsim.radiation.dose_operator`).
+    Natural background is included. It is the reading that is greatest less two standard deviations: of thousands of
+    readings of a few counts each, the greatest one is chance. The standard deviation is that of counting alone, without
+    the error of the conversion (see `swarmsim.radiation.dose_operator`).
     """
     samples = record.samples
     ambient, std, kerma = samples.dose_rate_usv_h, samples.dose_rate_std_usv_h, samples.kerma_rate_ugy_h
     if ambient is None or std is None or kerma is None or not len(ambient):
         return None
-    best = int(np.argmax(ambient))
+    best = int(np.argmax(ambient - SURE_SIGMA * std))
     return {
         "basis": "counts",
         "greatest_usv_h": float(ambient[best]),

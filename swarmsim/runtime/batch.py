@@ -235,7 +235,8 @@ def _in_turn(together: int, apply: Callable[..., Any], carried: Any, own: Any, c
 
     if only is None:
         made = jax.lax.map(evaluate, places.reshape(-1, size))
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:missions], made)
+        # -1 would say nothing of what has no size, such as the thickness of walls that are known
+        return jax.tree.map(lambda x: x.reshape(len(places), *x.shape[2:])[:missions], made)
     if size == missions:
         return jax.lax.cond(jnp.any(only), lambda: _chosen(only, evaluate(places), carried), lambda: carried)
     asked = jnp.sum(only)

@@ -8,6 +8,10 @@ from typing import Any
 
 from swarmsim.config.radiation import Material
 
+BUILDINGS = frozenset(
+    {"house", "barn", "building", "shed", "hut", "cabin", "hangar", "warehouse", "garage", "container"}
+)
+"""Words of things that are hollow, as a rule."""
 PREFIX_MIN = 4  # letters of a word from which on it is compared with the beginning of a word of a name
 
 
@@ -26,7 +30,9 @@ class Guess:
 
     def __str__(self) -> str:
         """For a message."""
-        return f"{self.name}: {self.material}" + ("" if self.wall_m is None else f", {self.wall_m:g} m")
+        built = {word for word in words(self.name) if word in BUILDINGS}
+        hint = ": say wall_m if it is hollow" if built else ""
+        return f"{self.name}: {self.material}, " + (f"solid{hint}" if self.wall_m is None else f"{self.wall_m:g} m")
 
 
 def guess(name: str, materials: Mapping[str, Material]) -> Guess | None:

@@ -70,6 +70,7 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
         (f"sources.0={{{LINE}: [[0, 40], [0, 75]]}}", "sources.0.line_m", ["outside the site", "[0.0, 75.0]"]),
         (f"sources.0={{{LINE}: [[40, 10], [40, 30]]}}", "sources.0.line_m", ["2 of the 24 points of the"]),
         ("vehicles.uav1.position_m=[-85, 0]", "vehicles.0.position_m", ["'uav1' starts outside the site", "x from"]),
+        ("vehicles.uav1.position_m=[-79.8, 0]", "vehicles.0.position_m", ["outside the fence", "x from -79.5 to 79.5"]),
         ("vehicles.uav1.position_m=[0, 8]", "vehicles.0.position_m", ["'uav1' starts inside an obstacle of brick"]),
         ("vehicles.uav1.position_m=[5.2, 0]", "vehicles.0.position_m", ["or touches it", "from every obstacle"]),
         ("vehicles.orpheus.position_m=[-69.9, 0]", "vehicles.3.position_m", ["'orpheus' starts where a rover cannot"]),
@@ -79,10 +80,10 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
         (f"{SURVEY}.line_spacing_m=130", FIRST, ["no room for one survey line", "smaller line_spacing_m"]),
         (
             f"{SURVEY}.area_m=[[-79, -60], [70, -60], [70, 60], [-79, 60]]", f"{FIRST}.area_m",
-            ["a survey line ends so near to the fence", "1 m from the fence, at [-79, ", "at least 1.78 m"],
+            ["a survey line ends so near to the fence", "0.5 m from the fence, at [-79, ", "at least 1.78 m"],
         ),
-        (f"{SURVEY}.speed_m_s=8", f"{FIRST}.speed_m_s", ["at 8 m/s could not stop", "10 m from", "at least 11.2 m"]),
-        ("failsafes.fence.margin_m=8.4", f"{FIRST}.speed_m_s", ["1.6 m from the fence", "a lower speed_m_s"]),
+        (f"{SURVEY}.speed_m_s=8", f"{FIRST}.speed_m_s", ["at 8 m/s could not stop", "9.5 m from", "at least 11.2 m"]),
+        ("failsafes.fence.margin_m=8.4", f"{FIRST}.speed_m_s", ["1.1 m from the fence", "a lower speed_m_s"]),
         ("phases.search.settings.target=[0, 90]", "phases.1.settings.target", ["the target lies outside"]),
         (f"phases.1={ROUND}", "phases.1.settings.points.1", ["the waypoint lies outside the site", "y from -70 to 70"]),
     ],
@@ -111,9 +112,9 @@ def test_what_fits_though_it_is_near(mission: Path, site: SiteModel, override: s
     assert check_site(load_scenario(mission, [override]), site) == []
 
 
-@pytest.mark.parametrize("override", ["[-70, -60], [-78.2, 0], [-70, 60]", "[-77, 0], [0, -69.9], [77, 0], [0, 69.9]"])
+@pytest.mark.parametrize("override", ["[-70, -60], [-77.7, 0], [-70, 60]", "[-77, 0], [0, -69.9], [77, 0], [0, 69.9]"])
 def test_lines_may_end_as_near_to_the_fence_as_a_vehicle_stops(mission: Path, site: SiteModel, override: str) -> None:
-    scenario = load_scenario(mission, [f"{SURVEY}.area_m=[{override}]", f"{SURVEY}.line_spacing_m=8"])
+    scenario = load_scenario(mission, [f"{SURVEY}.area_m=[{override}]", f"{SURVEY}.line_spacing_m=7"])
     assert check_site(scenario, site) == []
 
 

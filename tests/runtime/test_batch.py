@@ -64,6 +64,20 @@ def test_missions_side_by_side_or_in_turn_or_on_two_devices_are_each_its_own(cou
     assert len(result.sharding.device_set) == (2 if count == 4 else 1)
 
 
+@pytest.mark.parametrize("together", [1, 2])
+def test_results_without_a_size_are_kept(together, monkeypatch):
+    """As the thickness of walls that a mission knows."""
+    monkeypatch.setattr(batch, "_together", lambda: together)
+    missions = Batch(3, Clock())
+    empty = missions.spread([{"walls": np.zeros((2, 0), np.float32)}])
+    given = missions.put(np.arange(3, dtype=np.float32))
+    walls, values = missions.run(
+        f"empty {together}", lambda own, value: (own["walls"], value), [empty], given, in_turn=True
+    )
+    assert walls.shape == (3, 2, 0)
+    np.testing.assert_array_equal(values, [0.0, 1.0, 2.0])
+
+
 @pytest.mark.parametrize("together", [1, 2, 3, 8])
 @pytest.mark.parametrize("asked", ["100100", "000000", "111111", "011101"])
 def test_only_the_missions_that_are_asked_for_change(asked, together, monkeypatch):

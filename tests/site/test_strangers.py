@@ -157,6 +157,13 @@ def test_materials_are_guessed_from_names(name, material, wall_m):
     assert (material, wall_m) == (None, None) if found is None else (found.material, found.wall_m) == (material, wall_m)
 
 
+def test_a_solid_building_is_asked_about():
+    materials = load_all("materials")
+    assert str(guess("wooden_house", materials)) == "wooden_house: wood, solid: say wall_m if it is hollow"
+    assert str(guess("tree_trunk", materials)).endswith("solid")
+    assert str(guess("planks", materials)) == "planks: wood, 0.025 m"
+
+
 def test_words_of_names():
     assert words("HTMLRoof_tiles02-RED") == ["html", "roof", "tiles", "red"]
 
