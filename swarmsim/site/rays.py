@@ -164,7 +164,7 @@ def _clusters(boxes: Obstacles) -> Obstacles:
     rows = -len(order) % CLUSTER
 
     def clustered(leaf: jax.Array) -> jax.Array:
-        padded = jnp.pad(leaf[order], [(0, rows)] + [(0, 0)] * (leaf.ndim - 1))
+        padded = jnp.pad(jnp.asarray(leaf)[order], [(0, rows)] + [(0, 0)] * (leaf.ndim - 1))
         return padded.reshape(-1, CLUSTER, *leaf.shape[1:])
 
     return jax.tree.map(clustered, boxes)
