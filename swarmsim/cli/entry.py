@@ -46,6 +46,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         sys.stderr.write("\nstopped with Ctrl-C: nothing unfinished was left behind\n")
+        if arguments is None:
+            # the interpreter would wait for what another thread still compiles or computes, which can take minutes
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(EXIT_INTERRUPTED)
         return EXIT_INTERRUPTED
     return 0
 

@@ -15,7 +15,8 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from threading import Thread
+from typing import Any, TypeVar
 
 import jax
 
@@ -29,6 +30,7 @@ _CHANGEABLE = ("jax_enable_x64", "jax_default_matmul_precision", "jax_debug_nans
 
 _Ready = tuple[Callable[..., Any], Any]  # a compiled function of arrays to arrays, and the tree of its results
 _COMPILED: Source = "compiled"
+T = TypeVar("T")
 
 
 class Program:
@@ -72,7 +74,7 @@ class Program:
         call, tree = self._last[1]
         start = time.perf_counter()
         results = call(*leaves)
-        jax.block_until_ready(results[-1:])  # an executable's results are ready together
+        _waited_for(lambda: jax.block_until_ready(results[-1:]))  # an executable's results are ready together
         self._clock.add("ran", self.name, time.perf_counter() - start)
         return jax.tree.unflatten(tree, results)
 
@@ -132,7 +134,8 @@ class Program:
         flat.__name__ = self.name.replace(" ", "_")  # what profilers show
         ends = [0, *itertools.accumulate(len(jax.tree.leaves(argument)) for argument in arguments)]
         donated = [leaf for number in self._donate for leaf in range(ends[number], ends[number + 1])]
-        return _machine_code(jax.jit(flat, donate_argnums=donated).lower(*leaves)), trees[0]
+        lowered = jax.jit(flat, donate_argnums=donated).lower(*leaves)
+        return _waited_for(lambda: _machine_code(lowered)), trees[0]
 
     def _key(self, leaves: Sequence[Any], structure: Any) -> str | None:
         """The key of the executable; None, with a warning, where the function cannot be identified."""
@@ -269,3 +272,17 @@ def _strongly_typed(result: Any) -> Any:
 def _leaf_text(leaf: Any) -> str:
     shape, dtype, weak_type, sharding = _leaf(leaf)
     return f"{shape} {dtype} {weak_type} {sharding_text(sharding) if sharding is not None else 'anywhere'}"
+
+
+def _waited_for(long: Callable[[], T]) -> T:
+    """The value of ``long``, which another thread computes: Ctrl-C interrupts waiting, but not XLA itself."""
+    future: Future[T] = Future()
+
+    def compute() -> None:
+        try:
+            future.set_result(long())
+        except BaseException as error:  # goes to the thread that waits
+            future.set_exception(error)
+
+    Thread(target=compute, name="swarmsim-wait", daemon=True).start()
+    return future.result()
