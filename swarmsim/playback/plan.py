@@ -9,13 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends import backend_pdf  # noqa: F401 - with its fonts' library, or `savefig` imports it last
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Patch
 from numpy.typing import NDArray
 
 from swarmsim.playback.colours import ESTIMATE, TRUTH
 from swarmsim.results.record import Estimate, MissionRecord
-from swarmsim.site.model import SiteModel
+from swarmsim.site.model import SiteModel, height_at
 
 SINGLE_COLUMN_IN = 3.5  # 89 mm: one column of a two-column journal
 DOUBLE_COLUMN_IN = 7.16  # 182 mm: its full text width
@@ -100,21 +101,32 @@ def new_pair(site_model: SiteModel, centre_m: NDArray[np.floating], half_m: floa
     return figure, whole, close
 
 
+def _seen_from_above(site_model: SiteModel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Corners [k, 4, 2] of the boxes of what stands on the site, the tallest last, and their heights [k] above ground.
+
+    The raster of the surface would show them up to a cell larger on every side.
+    """
+    site, boxes = site_model.site, site_model.site.obstacles
+    centre, half = np.asarray(boxes.centre_m, float), np.asarray(boxes.half_extent_m, float)
+    along = np.asarray(boxes.axis, float)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    ground = height_at(site, centre[:, :2])
+    above = centre[:, 2] + half[:, 2] - ground
+    order = np.argsort(above)
+    order = order[(above[order] >= BUILDING_MIN_HEIGHT_M) & np.all(half[order] > 0.0, axis=1)]
+    signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    sides = np.stack([along * half[:, :1], across * half[:, 1:2]], axis=1)  # [k, 2, 2]
+    corners = centre[:, None, :2] + signs @ sides
+    return corners[order], above[order]
+
+
 def draw_site(axes: Axes, site_model: SiteModel) -> None:
     """Buildings and other tall things in grey, the taller the darker; scale equal, north up."""
-    site = site_model.site
-    above = np.asarray(site.surface_m, float) - np.asarray(site.terrain_m, float)
-    shade = np.ma.masked_less(above, BUILDING_MIN_HEIGHT_M)
-    axes.imshow(
-        shade,
-        extent=site_extent(site_model),
-        origin="lower",
-        cmap="Greys",
-        vmin=-8.0,  # so that the lowest is already a clear grey
-        vmax=max(18.0, float(above.max()) * 1.4),
-        interpolation="nearest",
-        zorder=1,
-    )
+    corners, above = _seen_from_above(site_model)
+    shapes = PolyCollection(list(corners), cmap="Greys", edgecolors="face", linewidths=0.5, zorder=1)
+    shapes.set_array(above)
+    shapes.set_clim(-8.0, max(18.0, float(above.max(initial=0.0)) * 1.4))  # so that the lowest is already a clear grey
+    axes.add_collection(shapes)
     axes.set_aspect("equal")
     axes.set_xlabel("East [m]")
     axes.set_ylabel("North [m]")

@@ -8,7 +8,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
-from matplotlib.collections import PathCollection
+from matplotlib.collections import PathCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.text import Text
@@ -54,12 +54,14 @@ def test_trajectories_show_every_track_over_the_buildings(found: MissionRecord, 
     for vehicle in found.vehicles:
         track = drawn[vehicle.name]
         assert np.ptp(track, axis=0) == pytest.approx(np.ptp(vehicle.position_m[:, :2], axis=0), abs=0.3)
-    shade = axes.images[0].get_array()
-    x, y = np.meshgrid(np.arange(-74.5, 75), np.arange(-59.5, 60))
-    inside = np.zeros(x.shape, bool)
+    (shapes,) = [c for c in axes.collections if isinstance(c, PolyCollection)]
+    points = np.stack(np.meshgrid(np.arange(-74.6, 75), np.arange(-59.6, 60)), axis=-1).reshape(-1, 2)
+    inside = np.zeros(len(points), bool)
     for cx, cy, length, width, _ in synthetic.BUILDINGS:
-        inside |= (np.abs(x - cx) <= length / 2) & (np.abs(y - cy) <= width / 2)
-    np.testing.assert_array_equal(~np.ma.getmaskarray(shade), inside)
+        inside |= np.all(np.abs(points - (cx, cy)) <= (length / 2, width / 2), axis=1)
+    shaded = np.any([path.contains_points(points) for path in shapes.get_paths()], axis=0)
+    np.testing.assert_array_equal(shaded, inside)
+    assert np.max(shapes.get_array()) == pytest.approx(max(height for *_, height in synthetic.BUILDINGS), abs=0.01)
 
 
 def test_flown_measurements_are_all_there_in_the_colour_of_their_rate(found: MissionRecord, site: SiteModel) -> None:
