@@ -28,6 +28,9 @@ from swarmsim.results.record import Estimate, MissionRecord, Phase, RadiationMap
 from swarmsim.site.model import SiteModel
 
 _RATE_LABEL = "Count rate, 1 s mean [1/s]"
+MARGIN_M = 3.0  # around what a close-up shows
+NEAR_SHARE, MOST_SHARE = 0.18, 0.35  # of the site's smaller side: half sides of close-ups of two things, and of any
+NOWHERE = np.zeros((0, 2))
 _TRACK_POINTS_MAX = 50_000  # of all vehicles
 _TRACK_COLUMNS = 3  # of the legend
 
@@ -117,7 +120,7 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
                       markeredgecolor="black", markeredgewidth=1.0, label="hotspot", zorder=6)  # fmt: skip
         plan.draw_truth(axes, record)
         plan.draw_estimate(axes, record.survey_estimate, "survey estimate, 95 % ellipse")
-    plan.colour_bar(figure, close, image, "Count rate, interpolated [1/s]")
+    plan.colour_bar(figure, close, image, f"Count rate, interpolated, $\\pm$ {np.median(made.std_cps):.2g} [1/s]")
     handles, _ = whole.get_legend_handles_labels()
     plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="obstacles")])
     return figure
@@ -157,16 +160,14 @@ def _outline_buildings(axes: Axes, site_model: SiteModel) -> None:
 def driven_measurements(phase: Phase, record: MissionRecord, site_model: SiteModel) -> Figure:
     """Count rates of a phase that was driven, along the planned paths, with a close-up.
 
-    The close-up shows the estimate, or the greatest count rate where the phase did not come near the estimate.
+    The close-up shows the estimate and the greatest count rate, or the latter alone where they lie far apart.
     """
     samples = record.samples.of_phase(phase.name)
     rate = smoothed_rate(samples)
     norm = log_scale(rate).norm
     x, y, _ = samples.position_m.T
     strongest = samples.position_m[[np.argmax(rate)], :2]
-    centre, half = _close_up(record.estimate, strongest, site_model)
-    if not ((abs(x - centre[0]) < half) & (abs(y - centre[1]) < half)).any():
-        centre, half = _close_up(None, strongest, site_model)
+    centre, half = _close_up(record.estimate, strongest, site_model, strongest)
     figure, whole, close = plan.new_pair(site_model, centre, half)
     paths = [record.paths_m[number] for number in phase.vehicles if number in record.paths_m]
     for axes, size in ((whole, 5.0), (close, 14.0)):
@@ -192,16 +193,30 @@ def _plain_log_ticks(bar: Axes, norm: object) -> None:
 
 
 def _close_up(
-    estimate: Estimate | None, otherwise_m: NDArray[np.floating], site_model: SiteModel
+    estimate: Estimate | None,
+    otherwise_m: NDArray[np.floating],
+    site_model: SiteModel,
+    with_m: NDArray[np.floating] = NOWHERE,
 ) -> tuple[NDArray[np.floating], float]:
-    """Centre [2] and half side (m) of a close-up: the estimate, else the first of ``otherwise_m`` [n, 2]."""
+    """Centre [2] and half side (m) of a close-up within the site.
+
+    It shows the estimate, else the first of ``otherwise_m`` [n, 2], and of ``with_m`` [n, 2] what lies so near to the
+    former that both have room; else these.
+    """
     west, east, south, north = plan.site_extent(site_model)
-    half = min(10.0, 0.25 * (east - west), 0.25 * (north - south))
+    low, high = np.array([west, south]), np.array([east, north])
+    most = MOST_SHARE * float(min(high - low))
+    half = min(10.0, 0.25 * float(min(high - low)))
+    centre = np.asarray(otherwise_m[0], float) if len(otherwise_m) else 0.5 * (low + high)
     if estimate is not None:
-        half = max(half, 0.75 * plan.ellipse_95(estimate.covariance_m2)[0])
-        return np.asarray(estimate.position_m[:2], float), half
-    middle = np.array([0.5 * (west + east), 0.5 * (south + north)])
-    return (np.asarray(otherwise_m[0], float) if len(otherwise_m) else middle), half
+        place = np.asarray(estimate.position_m[:2], float)
+        shown = np.concatenate([place[None], with_m])
+        needed = 0.5 * float(np.max(np.ptp(shown, axis=0))) + MARGIN_M
+        if needed <= NEAR_SHARE * float(min(high - low)):
+            centre = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
+            half = max(half, needed, 0.75 * plan.ellipse_95(estimate.covariance_m2)[0])
+    half = min(half, most)
+    return np.clip(centre, low + half, high - half), half
 
 
 def spectrum(record: MissionRecord, site_model: SiteModel) -> Figure:
