@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from swarmsim.config.errors import InputError
 from swarmsim.estimation import Estimated
 from swarmsim.missions.state import MissionState
 from swarmsim.radiation.dose import gamma_constant
@@ -41,7 +42,10 @@ CROWDED = "more vehicles were in one place than the neighbour search holds: a co
 
 
 def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> MissionRecord:
-    """Mission number ``index`` of a batch."""
+    """Mission number ``index`` of a batch. Raises `InputError` where it has no such one."""
+    if not 0 <= index < len(batch.seeds):
+        numbers = f"0 to {len(batch.seeds) - 1}"
+        raise InputError.of("there is no such mission in the batch", given=str(index), allowed=numbers)
     end = _row(batch.end, index)
     phases = _phases(simulation, end)
     tracks = [_tracks(batch, index, group) for group in range(len(simulation.world.groups))]

@@ -89,6 +89,12 @@ def test_mission_k_of_a_batch_is_the_mission_of_its_seed(simulation, batch, reco
     assert alone.spectrum.nuclide == together.spectrum.nuclide
 
 
+@pytest.mark.parametrize("index", [-1, 2])
+def test_there_are_records_of_the_batchs_missions_alone(simulation, batch, index):
+    with pytest.raises(swarmsim.InputError, match="no such mission in the batch"):
+        swarmsim.mission_record(simulation, batch, index)
+
+
 def test_seeds_differ(records):
     first, second = (record.samples.of_phase("survey").counts for record in records)
     count = min(len(first), len(second))
@@ -113,6 +119,7 @@ def test_a_run_is_written_whole_and_flies_again(simulation, records, tmp_path):
     swarmsim.write_run(simulation, records, tmp_path / "first")
     rows = pq.read_table(tmp_path / "first" / MISSIONS).to_pylist()
     assert [row["seed"] for row in rows] == [5, 6]
+    assert [row["drawn_sources_0_activity_mbq"] for row in rows] == [170.0, 170.0]  # what `rollout` was given
     assert all(row["success"] for row in rows)
     for name in (MEASUREMENTS, TRAJECTORIES, "mission.rrd", "radiation_map.npz", "summary.json", "scenario.yaml"):
         assert (tmp_path / "first" / name).stat().st_size > 0
