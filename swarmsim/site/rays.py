@@ -14,7 +14,7 @@ from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site, sample
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
-NEIGHBOURS = 32  # segments that are intersected with the same clusters of boxes
+NEIGHBOURS = 16  # segments that are intersected with the same clusters of boxes
 CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
 _TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
 _PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is parallel to the slab
