@@ -45,7 +45,7 @@ app = App(
         "    swarmsim list vehicles       what there is to build a team of\n\n"
         "'swarmsim COMMAND --help' says more of a command, with examples.\n"
         "Exit codes: 0 done, 2 wrong input (told on standard error), 3 a doubtful answer of 'run --strict',\n"
-        "130 stopped with Ctrl-C."
+        "130 stopped with Ctrl-C, 143 by SIGTERM."
     ),
     version=_version,
     help_format="plaintext",

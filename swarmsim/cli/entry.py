@@ -4,6 +4,7 @@ import atexit
 import gc
 import io
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -12,7 +13,15 @@ from cyclopts import CycloptsError
 from swarmsim.cli.commands import app
 from swarmsim.config.errors import InputError
 
-EXIT_INPUT, EXIT_INTERRUPTED = 2, 130
+EXIT_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which batch systems send: a run is stopped as by Ctrl-C."""
+
+
+def _terminate(number: int, frame: object) -> None:
+    raise Terminated
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,6 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # so that a file or a pipe shows how far a run is
+    if arguments is None:
+        signal.signal(signal.SIGTERM, _terminate)
     atexit.register(gc.freeze)  # the interpreter's last collection of garbage would take another second
     try:
         os.getcwd()
@@ -44,14 +55,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INPUT
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except KeyboardInterrupt:
-        sys.stderr.write("\nstopped with Ctrl-C: nothing unfinished was left behind\n")
+    except KeyboardInterrupt as stop:
+        code = EXIT_TERMINATED if isinstance(stop, Terminated) else EXIT_INTERRUPTED
+        by = "by SIGTERM" if isinstance(stop, Terminated) else "with Ctrl-C"
+        sys.stderr.write(f"\nstopped {by}: nothing unfinished was left behind\n")
         if arguments is None:
             # the interpreter would wait for what another thread still compiles or computes, which can take minutes
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(EXIT_INTERRUPTED)
-        return EXIT_INTERRUPTED
+            os._exit(code)
+        return code
     return 0
 
 

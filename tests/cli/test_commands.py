@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -89,6 +90,37 @@ def test_the_help_is_quick_and_says_what_there_is() -> None:
         assert word in result.stdout
     assert result.stderr == ""
     assert took < 5.0  # 0.15 s on a quiet machine; an import of jax alone costs more than this under load
+
+
+@pytest.mark.parametrize(
+    ("sent", "code", "told"),
+    [(signal.SIGINT, 130, "stopped with Ctrl-C"), (signal.SIGTERM, 143, "stopped by SIGTERM")],
+)
+def test_a_run_is_stopped_at_once_whatever_another_thread_does(sent: int, code: int, told: str, tmp_path: Path) -> None:
+    """The main thread waits for one that does not end; what the command wrote for itself is taken away."""
+    script = """
+import sys, threading, time
+from pathlib import Path
+from swarmsim.atomic_folder import atomic_folder
+from swarmsim.cli import entry
+def command(*arguments, **options):
+    with atomic_folder(Path(sys.argv[1]), lambda _: None):
+        threading.Thread(target=time.sleep, args=(600,)).start()
+        print("ready", flush=True)
+        time.sleep(600)
+entry.app = command
+entry.main()
+"""
+    arguments, pipe = [sys.executable, "-c", script, str(tmp_path / "run")], subprocess.PIPE
+    with subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True) as running:
+        assert running.stdout is not None
+        ready = running.stdout.readline()
+        running.send_signal(sent)
+        _, error = running.communicate(timeout=60)
+    assert ready == "ready\n", error
+    assert running.returncode == code
+    assert told in error
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_help_imports_nothing_heavy() -> None:
