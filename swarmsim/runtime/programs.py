@@ -100,7 +100,7 @@ class Program:
         leaves, structure = jax.tree.flatten(tuple(arguments))
         with uncollected():
             key = self._key(leaves, structure)
-            return (self._compile(arguments), _COMPILED) if key is None else self._shared(key, arguments)
+            return (self._compile(arguments)[0], _COMPILED) if key is None else self._shared(key, arguments)
 
     def _shared(self, key: str, arguments: Sequence[Any]) -> tuple[_Ready, Source]:
         """The executable of a key: of this process, or from the user's folder, or compiled and stored there."""
@@ -110,19 +110,18 @@ class Program:
             if executable is not None:
                 _EXECUTABLES.put(key, executable)
                 return (executable.call, executable.results_tree(structure)), "loaded"
-            before = cache_reads()
-            call, results = self._compile(arguments)
+            (call, results), read = self._compile(arguments)
             try:
                 executable = Executable.of(call, results, structure)
                 _EXECUTABLES.put(key, executable)
-                if cache_reads() == before:
+                if not read:
                     executable.save(key)
             except UnstorableError as error:
                 _warn_not_kept(self.name, error)
             return (call, results), _COMPILED
 
-    def _compile(self, arguments: Sequence[Any]) -> _Ready:
-        """The function of flat arguments and results, compiled, with the tree of its results."""
+    def _compile(self, arguments: Sequence[Any]) -> tuple[_Ready, bool]:
+        """The function of flat arguments and results, compiled, with the tree of its results; whether JAX had it."""
         leaves, structure = jax.tree.flatten(tuple(arguments))
         trees = []
 
@@ -135,7 +134,13 @@ class Program:
         ends = [0, *itertools.accumulate(len(jax.tree.leaves(argument)) for argument in arguments)]
         donated = [leaf for number in self._donate for leaf in range(ends[number], ends[number + 1])]
         lowered = jax.jit(flat, donate_argnums=donated).lower(*leaves)
-        return _waited_for(lambda: _machine_code(lowered)), trees[0]
+
+        def compiled() -> tuple[Callable[..., Any], bool]:
+            before = cache_reads()  # of this thread
+            return _machine_code(lowered), cache_reads() > before
+
+        code, read = _waited_for(compiled)
+        return (code, trees[0]), read
 
     def _key(self, leaves: Sequence[Any], structure: Any) -> str | None:
         """The key of the executable; None, with a warning, where the function cannot be identified."""
