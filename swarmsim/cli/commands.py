@@ -109,9 +109,9 @@ def run(
 def bench(
     scenario: str = "recon",
     *,
-    missions: Annotated[int, Parameter(validator=Number(gte=2, lte=1_000_000))] = 64,
+    missions: Annotated[int, Parameter(validator=Number(gte=2, lte=1_000_000), converter=_whole)] = 64,
     fleet: Annotated[int, Parameter(validator=Number(gte=0, lte=100_000_000))] = 0,
-    repeats: Annotated[int, Parameter(validator=Number(gte=1, lte=100))] = 2,
+    repeats: Annotated[int, Parameter(validator=Number(gte=1, lte=100), converter=_whole)] = 2,
     overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
 ) -> None:
     """Measure how fast a scenario flies here: one mission, and a batch against it. Writes nothing.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.radiation import Detector as DetectorSpec
-from swarmsim.config.radiation import DetectorMount
+from swarmsim.config.radiation import DetectorMount, Nuclide
 from swarmsim.pytree import on_device, pytree, static
 from swarmsim.radiation import scattering
 from swarmsim.radiation.attenuation import linear_attenuation
@@ -161,7 +161,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         stranger=f32(np.arange(len(known)) >= len(library.nuclides)),
         material_names=library.material_names,
         kind=kind,
-        **_spectra(spec, library, response, energy, bins, ground_bins, counted),
+        **_spectra(spec, library, known, response, energy, bins, ground_bins, counted),
     )
 
 
@@ -260,6 +260,7 @@ def _mean_area(counting: Counting, energy: Floats, size: tuple[float, float]) ->
 def _spectra(
     spec: DetectorSpec,
     library: Library,
+    known: tuple[Nuclide, ...],
     response: Response | None,
     energy: Floats,
     bins: Floats,
@@ -297,7 +298,7 @@ def _spectra(
     natural = orders(response, shape * np.stack([np.ones_like(shape), tilt(response.channel_centre_kev)]))
     peak_orders = orders(response, peaks)[back].reshape(*energy.shape, len(GAINS), ORDERS, -1)
     rois = rois_of(response, spec.spectrometer.rois_kev)
-    known = spectra_of(response, library.nuclides + others_than(library.nuclide_names), library.materials, counted)
+    spectra = spectra_of(response, known, library.materials, counted)
     return {
         "peak_spectrum": f32(peaks[back].reshape(*energy.shape, -1)),
         "bin_spectrum": f32(of_bins),
@@ -305,8 +306,8 @@ def _spectra(
         "bin_orders": f32(orders(response, of_bins)),
         "natural_orders": f32(np.swapaxes(natural, 0, 1)),
         "grid_spectrum": f32(shielded_lines(response, library.materials, counted)),
-        "known_spectrum": f32(known.total),
-        "known_scattered": f32(known.scattered),
+        "known_spectrum": f32(spectra.total),
+        "known_scattered": f32(spectra.scattered),
         "peak_rois": f32((peaks @ rois)[back].reshape(*energy.shape, -1)),
         "scattered_rois": f32(bins @ of_bins @ rois),
         "ground_rois": f32(ground_bins @ of_bins @ rois),

@@ -35,7 +35,7 @@ from swarmsim.world.build import detector_models
 
 LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
 """Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
-LIKELY = 0.5  # a stranger is told that the source rather is than not
+LIKELY = 0.5  # probability above which the finding says which stranger an unknown source is like
 UNNAMED = {NONE: "none", UNKNOWN: "unknown"}
 """What a spectrum is said to show where no nuclide is named."""
 CROWDED = "more vehicles were in one place than the neighbour search holds: a collision may have gone unnoticed"

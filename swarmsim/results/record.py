@@ -137,7 +137,7 @@ class Spectrum:
     goodness: float = 1.0  # p-value of the deviance of the fit
     detector: str = ""  # model that took it
     begin_s: float = 0.0  # when its first sample began
-    alike: str = ""  # of an unknown source: the nuclide outside the library that it rather is than not, if any
+    alike: str = ""  # the nuclide outside the library that an unknown source most likely is, if likelier than not
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from swarmsim.results.record import (
 from swarmsim.versions import package_versions
 from swarmsim.world.events import FAILSAFES, KINDS, LOSSES
 
+SURE_SIGMA = 2.0  # the greatest dose rate is that of the reading that is greatest less so many standard deviations
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "rerun-sdk")
 _ESTIMATE_KEYS = (
     "position_m",
@@ -216,9 +217,6 @@ def _true_dose(record: MissionRecord, source: TrueSource) -> dict[str, float]:
         "dose_rate_1m_usv_h": constant.ambient_usv_h * activity,
         "kerma_rate_1m_ugy_h": constant.kerma_ugy_h * activity,
     }
-
-
-SURE_SIGMA = 2.0  # standard deviations by which a dose rate is at least as great
 
 
 def dose_summary(record: MissionRecord) -> dict[str, Any] | None:

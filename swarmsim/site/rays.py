@@ -192,7 +192,8 @@ def _near(boxes: Obstacles, a: jax.Array, ends: jax.Array) -> jax.Array:
     middles = [-x * i for x, i in zip(start, inverse, strict=True)]
     enter = jnp.maximum(_most([m - r for m, r in zip(middles, reach, strict=True)]), 0.0)
     leave = jnp.minimum(_least([m + r for m, r in zip(middles, reach, strict=True)]), 1.0)
-    return (leave >= enter) & (radius > 0.0)
+    # an end that is no number (padding may hold anything) must not hide a box from its neighbours
+    return ~(leave < enter) & (radius > 0.0)
 
 
 def _in_axes(boxes: Obstacles, vector: jax.Array) -> list[jax.Array]:

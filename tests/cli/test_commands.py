@@ -154,6 +154,8 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "recon", "--seed", "-1"], "--seed"),
         (["draw", "random_recon", "--seed", "1.5"], "1.5"),
         (["run", "recon", "--missions", "2.5"], "2.5"),
+        (["bench", "recon", "--missions", "3.5"], "3.5"),
+        (["bench", "recon", "--repeats", "1.5"], "1.5"),
         (["run", "recon", "--missions", "0"], "--missions"),
         (["schema", "vehicl"], "vehicle"),
         (["check"], "name at least one file"),

@@ -44,6 +44,16 @@ def test_a_spectrum_that_names_it_says_how_well():
     assert "fits the spectrum badly (p = 1e-05)" in finding(SURE, ONE, spectrum(named, 1e-5), False, False)
 
 
+def test_certainty_is_never_stated():
+    sure = replace(spectrum(ONE[0].nuclide), confidence=0.99999)
+    assert finding(SURE, ONE, sure, False, False).endswith("; identified with more than 99.9%")
+
+
+def test_an_unknown_source_is_said_to_be_like_a_stranger():
+    unknown = replace(spectrum("unknown"), alike="Sb-124")
+    assert finding(SURE, ONE, unknown, False, False).endswith("of none in the library with 97%, most like Sb-124")
+
+
 def test_several_sources_and_doubts_are_told():
     two = (estimate(), estimate(20.0, nuclide="Cs-137"))
     doubt = Verdict(status="ambiguous", reasons=("a", "b"), covered=1.0)

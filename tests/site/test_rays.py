@@ -220,6 +220,20 @@ def test_clusters_that_are_left_out_are_not_crossed(together):
     assert 0.1 < float(crosses) < 1.0
 
 
+def test_an_end_that_is_no_number_hides_nothing_from_its_neighbours():
+    site = make_site([((5.0, 0.0, 1.0), (0.5, 20.0, 3.0), 0.0, 0.0, "concrete")])
+    ends = jnp.array([[10.0, y, 1.0] for y in np.linspace(-3.0, 3.0, 16)], jnp.float32)
+    start, found = (
+        jnp.array([0.0, 0.0, 1.0]),
+        jax.jit(lambda b: crossed_from(site, jnp.array([0.0, 0.0, 1.0]), b).length_m),
+    )
+    expected = np.asarray(jax.vmap(lambda b: path_lengths(site, start, b))(ends))
+    for nothing in (np.nan, np.inf):
+        lengths = np.asarray(found(ends.at[7].set(nothing)))
+        np.testing.assert_allclose(np.delete(lengths, 7, axis=0), np.delete(expected, 7, axis=0), atol=1e-5)
+    assert expected[:, CONCRETE].min() > 0.9
+
+
 def shape_of(site, a, b):
     way = crossed_of(site, jnp.array(a, jnp.float32), jnp.array(b, jnp.float32))
     return float(way.length_m[CONCRETE]), float(way.shape.thin_m[CONCRETE]), way.shape
