@@ -385,6 +385,16 @@ def test_an_export_is_replaced_only_if_asked(simulation: swarmsim.Simulation, re
     assert [path.name for path in (tmp_path / "n42").iterdir()] == ["tube.n42"]
 
 
+def test_the_spectrum_near_the_source_began_with_its_first_sample(
+    simulation: swarmsim.Simulation, record, tmp_path: Path
+) -> None:
+    later = dataclasses.replace(record, spectrum=dataclasses.replace(record.spectrum, begin_s=73.5))
+    start = datetime.fromisoformat("2026-05-04T09:30:00+00:00")
+    path = write_n42(simulation, later, tmp_path / "n42", vehicles=["tube"], start=start)[0]
+    begun = texts(ElementTree.parse(path).getroot(), "RadMeasurement/StartDateTime")[0]
+    assert (datetime.fromisoformat(begun) - start).total_seconds() == pytest.approx(73.5)
+
+
 def test_a_mission_without_samples_says_so(simulation: swarmsim.Simulation, record, tmp_path: Path) -> None:
     nothing = dataclasses.replace(record, samples=record.samples.rows(slice(0, 0)))
     with pytest.raises(InputError, match="no detector has measured"):
