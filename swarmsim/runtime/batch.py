@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from swarmsim.device import on_processor
+from swarmsim.device import among_cores, on_processor
 from swarmsim.runtime.clock import Clock
 from swarmsim.runtime.programs import Program, prepare
 from swarmsim.scalars import Layout
@@ -54,6 +54,9 @@ class Batch:
         self.shards = shards if missions % shards == 0 else 1
         self._clock = clock
         self._mesh = Mesh(np.array(jax.devices()[: self.shards]), ("mission",)) if self.shards > 1 else None
+        # devices that a batch leaves idle
+        idle = on_processor() and self._mesh is None and len(jax.devices()) > 1
+        self._cores = Mesh(np.array(jax.devices()), ("core",)) if idle else None
         self._programs: dict[Any, Program] = {}
 
     def spread(self, trees: Sequence[Any]) -> "Spread":
@@ -77,6 +80,8 @@ class Batch:
 
     def put(self, array: Any, *, shared: bool = False) -> Any:
         """An array [B, …] spread over the devices, or a shared one copied to each."""
+        if self._cores is not None:  # what these have shared comes back to the first one for good
+            return jax.device_put(array, jax.devices()[0])
         if self._mesh is None:
             return jax.device_put(array)
         return jax.device_put(array, NamedSharding(self._mesh, PartitionSpec() if shared else PartitionSpec("mission")))
@@ -93,6 +98,7 @@ class Batch:
         in_turn: bool = False,
         donate: bool = False,
         again: "Again | None" = None,
+        shared: bool = False,
     ) -> Any:
         """``function(*inputs, carried, *common)`` of one mission, for all B at once.
 
@@ -108,19 +114,32 @@ class Batch:
             donate: the result takes over the buffers of ``carried``, which is not used again: nothing that merely
                 passes through is copied.
             again: evaluate the function, which then returns (carried, record, verdict), several times in one call.
+            shared: where missions are too few for all processor cores, these share what the function computes with
+                `swarmsim.device.each`.
 
         Returns:
             Its result with the mission axis on every leaf. With ``again`` (carried, records, verdict, times): records
             have an axis of evaluations after that of the missions, and were made ``times`` [B] times, as often for
             each mission; the rest of their rows are zero.
         """
-        program, arguments = self._call(name, function, inputs, carried, common, only, in_turn, donate, again)
-        return program(*arguments)
+        whole = self._call(name, function, inputs, carried, common, only, in_turn, donate, again, shared)
+        program, arguments = whole
+        if not shared or self._cores is None:
+            return program(*arguments)
+        results = program(*jax.device_put(arguments, NamedSharding(self._cores, PartitionSpec())))
+        return jax.tree.map(lambda x: x.addressable_shards[0].data, results)
 
     def prepare(self, calls: Sequence[dict[str, Any]]) -> None:
         """Begin to load or compile the programs of future calls of `run` (its arguments by name), side by side."""
-        defaults = {"common": (), "only": None, "in_turn": False, "donate": False, "again": None}
-        prepare([self._call(**(defaults | call)) for call in calls])
+        defaults = {"common": (), "only": None, "in_turn": False, "donate": False, "again": None, "shared": False}
+        work = []
+        for call in calls:
+            program, arguments = self._call(**(defaults | call))
+            if call.get("shared") and self._cores is not None:
+                everywhere = NamedSharding(self._cores, PartitionSpec())
+                arguments = jax.tree.map(partial(_placed, everywhere), arguments)
+            work.append((program, arguments))
+        prepare(work)
 
     def _call(
         self,
@@ -133,6 +152,7 @@ class Batch:
         in_turn: bool,
         donate: bool,
         again: "Again | None",
+        shared: bool,
     ) -> tuple[Program, tuple[Any, Any, Any]]:
         """The program and its arguments."""
         shape = (name, tuple((s.structure, s.carries) for s in inputs), only is not None, in_turn, donate, again)
@@ -142,13 +162,19 @@ class Batch:
             batched = partial(_in_turn, _together()) if in_turn or only is not None else _every
             if again is not None:  # parts of the batch would have to wait for one another after each
                 batched = partial(_again, again if self._mesh is None else replace(again, most=1))
-            whole = self._sharded(partial(batched, apply))
+            whole = self._sharded(partial(batched, apply), shared)
             taken = (0,) if donate else ()
             program = self._programs[shape] = Program(name, whole, clock=self._clock, donate=taken)
         return program, (carried, ([s.own for s in inputs], only), ([s.shared for s in inputs], tuple(common)))
 
-    def _sharded(self, function: Callable[..., Any]) -> Callable[..., Any]:
+    def _sharded(self, function: Callable[..., Any], shared: bool) -> Callable[..., Any]:
         """The function of equal parts of the missions, on the devices side by side; parts do not wait for another."""
+        if shared and self._cores is not None:
+            everywhere = PartitionSpec()
+            split = partial(_among_cores, function)
+            return jax.shard_map(
+                split, mesh=self._cores, in_specs=everywhere, out_specs=everywhere, check_vma=False
+            )  # fmt: skip
         if self._mesh is None:
             return function
         each, all_ = PartitionSpec("mission"), PartitionSpec()
@@ -175,6 +201,16 @@ class Spread:
         own, shared = iter(self.own), iter(self.shared)
         leaves = [np.asarray(next(own)[mission]) if carries else np.asarray(next(shared)) for carries in self.carries]
         return jax.tree.unflatten(self.structure, leaves)
+
+
+def _among_cores(function: Callable[..., Any], *arguments: Any) -> Any:
+    with among_cores("core"):
+        return function(*arguments)
+
+
+def _placed(sharding: NamedSharding, array: Any) -> jax.ShapeDtypeStruct:
+    """What an array will be like once it is there."""
+    return jax.ShapeDtypeStruct(array.shape, array.dtype, sharding=sharding)
 
 
 def _together() -> int:

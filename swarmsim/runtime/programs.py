@@ -28,6 +28,13 @@ from swarmsim.runtime.fingerprint import UnidentifiableError, fingerprint, shard
 # Settings that may change between two calls of a program; the others are set once, before JAX starts.
 _CHANGEABLE = ("jax_enable_x64", "jax_default_matmul_precision", "jax_debug_nans", "jax_default_device")
 
+_PATIENCE = (
+    "xla_cpu_collective_call_warn_stuck_seconds",
+    "xla_cpu_collective_call_terminate_timeout_seconds",
+    "xla_cpu_collective_timeout_seconds",
+)
+_FOREVER_S = 100_000_000
+
 _Ready = tuple[Callable[..., Any], Any]  # a compiled function of arrays to arrays, and the tree of its results
 _COMPILED: Source = "compiled"
 T = TypeVar("T")
@@ -162,15 +169,20 @@ def _machine_code(lowered: Any) -> Any:
     """A lowered program, compiled.
 
     Where XLA's CPU compiler still has a choice (until jaxlib 0.10), its older way of emitting loops compiles a mission
-    in three quarters of the time, and the mission flies as fast.
+    in three quarters of the time, and the mission flies as fast. Devices that exchange data wait for one another as
+    long as it takes: XLA would end the process after half a minute, and so one that was suspended.
     """
+    options: dict[str, Any] = {}
     if jax.default_backend() == "cpu":
+        options = {"xla_cpu_use_fusion_emitters": False} | dict.fromkeys(_PATIENCE, _FOREVER_S)
+    while True:
         try:
-            return lowered.compile(compiler_options={"xla_cpu_use_fusion_emitters": False})
+            return lowered.compile(compiler_options=options)
         except jax.errors.JaxRuntimeError as error:
-            if "No such compile option" not in str(error):
+            unknown = [name for name in options if "No such compile option" in str(error) and name in str(error)]
+            if not unknown:
                 raise
-    return lowered.compile()
+            options = {name: value for name, value in options.items() if name not in unknown}
 
 
 def prepare(work: Sequence[tuple[Program, Sequence[Any]]]) -> None:

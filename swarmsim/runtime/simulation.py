@@ -275,6 +275,7 @@ class _Run:
             "common": (np.int32(tick),),
             "only": self._batch.put(begin),
             "donate": True,
+            "shared": True,
         }
 
     def _advance(self, mission: MissionState, tick: int, running: np.ndarray) -> dict[str, Any]:
@@ -292,10 +293,15 @@ class _Run:
 
     def _conclusion(self, mission: MissionState, keys: Any) -> dict[str, Any]:
         """The call that concludes the missions."""
-        carried = (keys, mission)
+        carried = (jax.random.key_data(keys), mission)
         return {
-            "name": "conclude", "function": _conclude, "inputs": self._inputs, "carried": carried, "in_turn": True
-        }  # fmt: skip
+            "name": "conclude",
+            "function": _conclude,
+            "inputs": self._inputs,
+            "carried": carried,
+            "in_turn": True,
+            "shared": True,
+        }
 
     def _prepare(self, keys: Any, mission: MissionState) -> None:
         """Begin to load or compile all programs of the mission, in the order that they are needed."""
@@ -361,7 +367,7 @@ def _onward(verdict: tuple[Signals, jax.Array], _: Any) -> tuple[jax.Array, Any]
 
 
 def _conclude(world: World, plan: Plan, carried: tuple[jax.Array, MissionState]) -> Conclusion:
-    key, mission = carried
+    key, mission = jax.random.wrap_key_data(carried[0]), carried[1]
     measurements = gathered(world, plan, mission.windows, key)
     known = survey(plan, *measurements) if mission.survey is None else mission.survey
     return conclude(key, world, plan, known, *measurements, mission.trail)

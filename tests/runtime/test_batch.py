@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmsim.device import each
 from swarmsim.runtime import batch
 from swarmsim.runtime.batch import SMALL, Batch, filled, shards_of
 from swarmsim.runtime.clock import Clock
@@ -62,6 +63,46 @@ def test_missions_side_by_side_or_in_turn_or_on_two_devices_are_each_its_own(cou
     result = missions.run(name, grown, [inputs], missions.put(values), (np.float32(0.5),), in_turn=in_turn)
     np.testing.assert_array_equal(result, [alone(s, v) for s, v in zip(scales, values, strict=True)])
     assert len(result.sharding.device_set) == (2 if count == 4 else 1)
+
+
+def tried(inputs, carried, numbers):
+    """Of every number: a float, a bool, an integer, what has no size, and bits that are no number as a float."""
+
+    def one(n):
+        value = jnp.sin(inputs["scale"] * n + carried)
+        return value, value > 0.0, jnp.int32(-n), jnp.zeros((2, 0)), jax.lax.bitcast_convert_type(value, jnp.uint32)
+
+    start = jax.tree.map(jnp.zeros_like, each(one, numbers, 1))
+    return jax.lax.fori_loop(0, 3, lambda k, found: each(one, numbers + k + found[0], 1), start)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 8])
+@pytest.mark.parametrize("missions", [1, 3])
+def test_cores_that_missions_leave_idle_share_what_each_computes(missions, count):
+    batch = Batch(missions, Clock())
+    inputs = batch.spread([of_mission(scale) for scale in range(1, missions + 1)])
+    numbers = np.arange(count, dtype=np.float32)
+    given = batch.put(np.arange(missions, dtype=np.float32))
+    call = {"inputs": [inputs], "carried": given, "common": (numbers,), "in_turn": True}
+    together = batch.run("together", tried, shared=True, **call)
+    by_itself = batch.run("by itself", tried, **call)
+    for a, b in zip(together, by_itself, strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        np.testing.assert_array_equal(a, b)
+        assert len(a.sharding.device_set) == 1
+
+
+def test_shared_work_is_compiled_once_for_preparation_and_calls():
+    clock = Clock()
+    batch = Batch(1, clock)
+    inputs, given = batch.spread([of_mission(1.0)]), batch.put(np.zeros(1, np.float32))
+    call = {"name": "once", "function": tried, "inputs": [inputs], "carried": given, "shared": True}
+    call["common"] = (np.arange(7, dtype=np.float32),)
+    batch.prepare([call])
+    batch.run(**call)
+    program = next(iter(batch._programs.values()))
+    assert len(program._executables) == 1
+    assert not program._coming
 
 
 @pytest.mark.parametrize("together", [1, 2])
