@@ -4,6 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from swarmsim.config.autopilot import Autopilot
 from swarmsim.config.base import Delay, Duration, Fraction, Gap, Length, Model, Name, Vec2
 from swarmsim.config.flight import Failsafes, FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
@@ -275,6 +276,7 @@ class Mission(Model):
     background: BackgroundField = BackgroundField()
     effects: FlightEffects = FlightEffects()
     failsafes: Failsafes = Failsafes()
+    autopilot: Autopilot = Autopilot()
     traffic: Traffic = Traffic()
     radio: Radio = Radio()
     mapping: Mapping | None = None

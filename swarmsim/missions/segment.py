@@ -25,20 +25,34 @@ def segment(world: World, plan: Plan, mission: MissionState) -> tuple[MissionSta
     The policies see what the team knew at the beginning of the period; what was counted in it is added at its end.
     """
     timing = world.timing
-    period_s = jnp.float32(timing.control_period_s)
 
     def judged(moving: MissionState, _: None) -> tuple[MissionState, jax.Array]:
-        began = now_s(world, moving.world)
-        moving = _moving(frame(world, plan, _whole(mission, moving)))
-        return moving, _packed((_poses(moving), _samples(moving, began + 0.5 * period_s)))
+        after, record = judged_frame(world, plan, _whole(mission, moving))
+        return _moving(after), record
 
-    every, logs = timing.log_ticks // timing.judge_ticks, timing.decision_ticks // timing.log_ticks
-    first = mission.world.clock.tick
     # one loop, or the arrays that all passes share would be copied at the beginning of every inner one
-    moved, record = jax.lax.scan(judged, _moving(mission), None, length=every * logs)
+    passes = timing.decision_ticks // timing.judge_ticks
+    moved, record = jax.lax.scan(judged, _moving(mission), None, length=passes)
+    return decided(world, plan, _whole(mission, moved), record)
+
+
+def judged_frame(world: World, plan: Plan, mission: MissionState) -> tuple[MissionState, jax.Array]:
+    """The mission one judging period later, and the record of that period for `decided`."""
+    began = now_s(world, mission.world)
+    mission = frame(world, plan, mission)
+    return mission, _packed((_poses(mission), _samples(mission, began + 0.5 * world.timing.control_period_s)))
+
+
+def decided(
+    world: World, plan: Plan, mission: MissionState, record: jax.Array
+) -> tuple[MissionState, Log, Signals]:  # fmt: skip
+    """What is learned and decided at the end of a decision period; ``record`` has a row for each judging period."""
+    timing = world.timing
+    period_s = jnp.float32(timing.control_period_s)
+    every, logs = timing.log_ticks // timing.judge_ticks, timing.decision_ticks // timing.log_ticks
+    first = mission.world.clock.tick - timing.decision_ticks
     tracks, samples = _unpacked(record, jax.eval_shape(lambda: (_poses(mission), _samples(mission, period_s))))
     tracks = jax.tree.map(lambda x: x[every - 1 :: every], tracks)
-    mission = _whole(mission, moved)
     mission = _learned(world, plan, mission, samples)
     runs = [jnp.isfinite(phase.began_s) & ~jnp.isfinite(phase.ended_s) for phase in mission.phases]
     mission = replace(mission, trail=followed(world, mission.trail, mission.world, jnp.any(jnp.stack(runs))))
@@ -266,4 +280,4 @@ def _last_end(states: list[PhaseState], now: jax.Array) -> jax.Array:
     return jnp.where(jnp.any(ended), jnp.max(jnp.where(ended, ends, 0.0)), now)
 
 
-__all__ = ["decide", "segment"]
+__all__ = ["decide", "decided", "judged_frame", "segment"]

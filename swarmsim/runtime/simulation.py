@@ -146,7 +146,7 @@ class Simulation:
         layout = layout_for(self.world.vehicles * batch.missions // batch.shards)
         draws = self._given(self.draw(numbers), values or {})
         worlds, plans = self._spread(batch, draws, layout)
-        run = _Run(batch, worlds, plans, self.plan, tell)
+        run = MissionRun(batch, worlds, plans, self.plan, tell)
         keys = batch.put(randomness.mission_keys(padded))
         end, segments = run.fly(keys)
         return MissionBatch(
@@ -159,6 +159,12 @@ class Simulation:
             clock=self.clock.copy(),
             draws=draws,
         )
+
+    def alone(self, seed: int) -> "tuple[Draws, Batch, Spread, Spread]":
+        """One mission's draws, and what its programs work on: for a host that runs them one by one."""
+        draws = self.draw(seed)
+        batch = self._batches.setdefault(1, Batch(1, self.clock))
+        return draws, batch, *self._spread(batch, draws, layout_for(self.world.vehicles))
 
     def _given(self, draws: Draws, values: Mapping[str, Sequence[Any]]) -> Draws:
         """The draws with ``values`` in their stead."""
@@ -224,7 +230,7 @@ def _built(scenario: Scenario, site_model: SiteModel) -> tuple[World, Plan]:
     return world, build_plan(scenario, site_model, world)
 
 
-class _Run:
+class MissionRun:
     """One rollout: the host's side of it."""
 
     def __init__(self, batch: Batch, worlds: Spread, plans: Spread, plan: Plan, tell: Progress):
@@ -235,8 +241,7 @@ class _Run:
     def fly(self, keys: Any) -> tuple[MissionState, list[Segment]]:
         """All missions to their end, a decision period at a time."""
         batch, names = self._batch, [phase.name for phase in self._plan.phases]
-        self._tell.phase("compile", 0.0)
-        mission, signals = batch.run("reset", _begin_mission, self._inputs, keys)
+        mission, signals = self.reset(keys)
         self._prepare(keys, mission)
         world = self._first_world()
         timing, tick = world.timing, 0
@@ -247,7 +252,7 @@ class _Run:
         while True:
             for number in np.flatnonzero(begin.any(axis=0)):
                 self._tell.phase(f"plan {names[number]}", 0.0)
-                mission = batch.run(**self._beginning(int(number), mission, tick, begin[:, number]))
+                mission = batch.run(**self.beginning(int(number), mission, tick, begin[:, number]))
                 told = ()
             running = self._running(mission) if begin.any() else np.asarray(active.any(axis=0))
             mission, (log, ran), (signals, ticks), periods = batch.run(**self._advance(mission, tick, running))
@@ -265,7 +270,13 @@ class _Run:
             if bool(np.asarray(signals.over).all()):
                 return mission, segments
 
-    def _beginning(self, number: int, mission: MissionState, tick: int, begin: np.ndarray) -> dict[str, Any]:
+    def reset(self, keys: Any) -> tuple[MissionState, Signals]:
+        """All missions at their beginning."""
+        self._tell.phase("compile", 0.0)
+        begun: tuple[MissionState, Signals] = self._batch.run("reset", _begin_mission, self._inputs, keys)
+        return begun
+
+    def beginning(self, number: int, mission: MissionState, tick: int, begin: np.ndarray) -> dict[str, Any]:
         """The call that begins a phase in the missions ``begin`` [B]."""
         return {
             "name": f"begin {self._plan.phases[number].name}",
@@ -306,7 +317,7 @@ class _Run:
     def _prepare(self, keys: Any, mission: MissionState) -> None:
         """Begin to load or compile all programs of the mission, in the order that they are needed."""
         nobody, groups = np.zeros(self._batch.missions, bool), len(mission.world.groups)
-        beginnings = [self._beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
+        beginnings = [self.beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
         calls = [*beginnings[:1], self._advance(mission, 0, np.ones(groups, bool)), *beginnings[1:]]
         calls += [self._conclusion(mission, keys)] if self._estimates else []
         self._batch.prepare(calls)
@@ -327,13 +338,13 @@ class _Run:
         return self._batch.run(**self._conclusion(mission, keys))
 
 
-def _with_clock(mission: MissionState, tick: jax.Array, running: jax.Array) -> MissionState:
+def with_clock(mission: MissionState, tick: jax.Array, running: jax.Array) -> MissionState:
     world = mission.world
     clock, key = WorldClock(tick=tick, running=running), jax.random.wrap_key_data(world.key)
     return replace(mission, world=replace(world, clock=clock, key=key))
 
 
-def _without_clock(mission: MissionState) -> MissionState:
+def without_clock(mission: MissionState) -> MissionState:
     """The mission without what all missions have in common, so that every leaf has the mission axis.
 
     Its key goes as plain numbers: JAX calls a program that returns keys in Python, 1 ms each time.
@@ -345,19 +356,19 @@ def _without_clock(mission: MissionState) -> MissionState:
 
 def _begin_mission(world: World, plan: Plan, key: jax.Array) -> tuple[MissionState, Signals]:
     mission, signals = begin_mission(key, world, plan)
-    return _without_clock(mission), signals
+    return without_clock(mission), signals
 
 
 def _begin_phase(number: int, world: World, plan: Plan, mission: MissionState, tick: jax.Array) -> MissionState:
     running = jnp.ones(len(world.groups), bool)
-    return _without_clock(begin_phase(world, plan, _with_clock(mission, tick, running), number))
+    return without_clock(begin_phase(world, plan, with_clock(mission, tick, running), number))
 
 
 def _segment(
     world: World, plan: Plan, mission: MissionState, tick: jax.Array, running: jax.Array
 ) -> tuple[MissionState, tuple[Log, jax.Array], tuple[Signals, jax.Array]]:
-    mission, log, signals = segment(world, plan, _with_clock(mission, tick, running))
-    return _without_clock(mission), (log, running), (signals, tick + world.timing.decision_ticks)
+    mission, log, signals = segment(world, plan, with_clock(mission, tick, running))
+    return without_clock(mission), (log, running), (signals, tick + world.timing.decision_ticks)
 
 
 def _onward(verdict: tuple[Signals, jax.Array], _: Any) -> tuple[jax.Array, Any]:
@@ -381,4 +392,4 @@ def _segment_of(log: Log, ran: np.ndarray, periods: int) -> Segment:
     return Segment(log=replace(log, tracks=tracks, samples=samples), periods=periods)  # type: ignore[arg-type]
 
 
-__all__ = ["MissionBatch", "Segment", "Simulation"]
+__all__ = ["MissionBatch", "MissionRun", "Segment", "Simulation"]

@@ -1,0 +1,112 @@
+"""What is asked of every setpoint before any byte of it is sent."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from swarmsim.autopilot.link import Setpoint, Vector
+from swarmsim.config.autopilot import SetpointLimits
+
+ROUNDING = 1.001  # a command at a limit may exceed it by float32's rounding
+
+
+class RefusedError(ValueError):
+    """A setpoint that must not be sent; the message says why."""
+
+
+@dataclass
+class Guard:
+    """Refuses setpoints that are not finite, too fast, out of the volume, or far from the last one.
+
+    Args:
+        limits: of the mission.
+        outline_m: [V, 2] corners of the area that positions stay in, convex and counter-clockwise, world.
+        ground_m: height of the ground where the vehicle started, world.
+        flies: whether heights are checked and climbing is limited by itself.
+    """
+
+    limits: SetpointLimits
+    outline_m: np.ndarray
+    ground_m: float
+    flies: bool
+    _last: tuple[float, Vector] | None = field(default=None, repr=False)
+
+    def check(self, setpoint: Setpoint, now_s: float) -> Setpoint:
+        """The setpoint, if it may be sent at the time ``now_s``; raises `RefusedError` if not."""
+        self._shape(setpoint)
+        self._motion(setpoint)
+        if setpoint.position_m is not None:
+            self._volume(setpoint.position_m)
+            self._jump(setpoint.position_m, now_s)
+            self._last = now_s, setpoint.position_m
+        return setpoint
+
+    def forget(self) -> None:
+        """The next position may lie anywhere in the volume: the vehicle has been elsewhere meanwhile."""
+        self._last = None
+
+    def _shape(self, s: Setpoint) -> None:
+        if s.position_m is None and s.velocity_m_s is None:
+            raise RefusedError("it has neither a position nor a velocity")
+        if s.body and s.position_m is not None:
+            raise RefusedError("it has a position in the body frame")
+        if s.yaw_rad is not None and s.yaw_rate_rad_s is not None:
+            raise RefusedError("it has both a yaw and a yaw rate")
+        for name, value in vars(s).items():
+            if value is None or isinstance(value, bool):
+                continue
+            numbers = np.asarray(value, np.float64)
+            if numbers.shape not in ((), (3,)) or not np.isfinite(numbers).all():
+                raise RefusedError(f"{name} is {value}: every number must be finite")
+
+    def _motion(self, s: Setpoint) -> None:
+        limits = self.limits
+        if s.velocity_m_s is not None:
+            *level, up = s.velocity_m_s
+            speed = math.hypot(*level)
+            if speed > ROUNDING * limits.speed_m_s:
+                raise RefusedError(f"its speed is {speed:.1f} m/s, limits.speed_m_s is {limits.speed_m_s:g}")
+            if self.flies and abs(up) > ROUNDING * limits.climb_m_s:
+                raise RefusedError(f"it climbs with {up:.1f} m/s, limits.climb_m_s is {limits.climb_m_s:g}")
+        if s.acceleration_m_s2 is not None:
+            size = math.hypot(*s.acceleration_m_s2)
+            if size > ROUNDING * limits.acceleration_m_s2:
+                raise RefusedError(
+                    f"its acceleration is {size:.1f} m/s2, limits.acceleration_m_s2 is {limits.acceleration_m_s2:g}"
+                )
+        rate = math.degrees(abs(s.yaw_rate_rad_s or 0.0))
+        if rate > ROUNDING * limits.yaw_rate_deg_s:
+            raise RefusedError(f"it turns with {rate:.0f} deg/s, limits.yaw_rate_deg_s is {limits.yaw_rate_deg_s:g}")
+
+    def _volume(self, place: Vector) -> None:
+        x, y, z = place
+        corners = np.asarray(self.outline_m, np.float64)
+        edges = np.roll(corners, -1, axis=0) - corners
+        inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
+        inside = np.min(np.sum((np.array([x, y]) - corners) * inward, axis=1))
+        if inside < self.limits.margin_m:
+            where = f"{-inside:.1f} m outside" if inside < 0 else f"{inside:.1f} m inside"
+            raise RefusedError(
+                f"its position ({x:.1f}, {y:.1f}) is {where} the site's outline: limits.margin_m is "
+                f"{self.limits.margin_m:g}"
+            )
+        above = z - self.ground_m
+        if self.flies and not -self.limits.floor_m <= above <= self.limits.ceiling_m:
+            raise RefusedError(
+                f"its height is {above:.1f} m above the start: allowed are -{self.limits.floor_m:g} to "
+                f"{self.limits.ceiling_m:g} m (limits.floor_m, limits.ceiling_m)"
+            )
+
+    def _jump(self, place: Vector, now_s: float) -> None:
+        if self._last is None:
+            return
+        then_s, before = self._last
+        apart = math.dist(place, before)
+        fastest = math.hypot(self.limits.speed_m_s, self.limits.climb_m_s if self.flies else 0.0)
+        allowed = self.limits.jump_m + fastest * max(0.0, now_s - then_s)
+        if apart > allowed:
+            raise RefusedError(
+                f"its position jumps by {apart:.1f} m in {now_s - then_s:.2f} s: {allowed:.1f} m are allowed "
+                "(limits.jump_m and the greatest speed)"
+            )

@@ -1,0 +1,67 @@
+"""How a vehicle of a mission is flown on a real autopilot (``swarmsim fly``)."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from swarmsim.config.base import Acceleration, Delay, Duration, Fraction, Gap, Model, Speed
+
+
+class SetpointLimits(Model):
+    """What no setpoint that is sent may exceed; it is checked before any byte leaves.
+
+    A position stays inside the site's outline less ``margin_m``, between ``floor_m`` below and ``ceiling_m`` above
+    where the vehicle started. Two positions in a row may lie ``jump_m`` farther apart than the speed allows.
+    """
+
+    speed_m_s: Speed = 8.0
+    climb_m_s: Speed = 3.0
+    acceleration_m_s2: Acceleration = 6.0
+    yaw_rate_deg_s: Annotated[float, Field(ge=1, le=720)] = 120.0
+    jump_m: Gap = 1.0
+    margin_m: Gap = 1.0
+    floor_m: Gap = 5.0
+    ceiling_m: Annotated[float, Field(ge=1, le=10_000)] = 120.0
+
+
+class Watchdogs(Model):
+    """After how long what is missed: setpoints of the mission, heartbeats and positions of the vehicle.
+
+    A vehicle whose setpoints are ``stale_s`` old holds; ``hold_s`` later it does what ``then`` says, and the mission
+    does not take it back. A battery below ``battery`` ends its part of the mission.
+    """
+
+    stale_s: Duration = 0.5
+    hold_s: Delay = 5.0
+    then: Literal["land", "return"] = "land"
+    heartbeat_s: Duration = 3.0
+    position_s: Duration = 1.0
+    battery: Fraction = 0.2
+
+
+class Autopilot(Model):
+    """How a vehicle is flown on a real autopilot.
+
+    ``at_end``: what it does when its part of the mission has ended in the air, and on Ctrl-C. ``on_takeover``: when
+    the operator changes its mode we stop commanding at once; ``resume`` goes on with the mission when the operator
+    changes it back, ``stop`` never does.
+    """
+
+    stream_hz: float = Field(default=20.0, ge=5, le=100)
+    take_off_m: float = Field(default=3.0, ge=0.5, le=100)
+    at_end: Literal["land", "hold", "return"] = "land"
+    on_takeover: Literal["stop", "resume"] = "stop"
+    ready_s: Duration = 120.0
+    answer_s: Duration = 5.0
+    take_off_s: Duration = 60.0
+    land_s: Duration = 120.0
+    limits: SetpointLimits = SetpointLimits()
+    watchdogs: Watchdogs = Watchdogs()
+
+    @model_validator(mode="after")
+    def _stream_is_not_stale(self) -> "Autopilot":
+        if self.watchdogs.stale_s * self.stream_hz < 2.0:
+            raise ValueError(
+                "watchdogs.stale_s is less than two periods of stream_hz: give it more, or stream more often"
+            )
+        return self

@@ -1,0 +1,217 @@
+"""A mission in real time with one of its vehicles outside: a judging period at a time, its pose in, its command out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from swarmsim import randomness
+from swarmsim.config.errors import InputError
+from swarmsim.missions.external import Measured, Seat, external_frame, joined, lost
+from swarmsim.missions.plan import Plan
+from swarmsim.missions.segment import decided
+from swarmsim.missions.state import MissionState, Signals
+from swarmsim.runtime.progress import Progress, SilentProgress
+from swarmsim.runtime.simulation import MissionBatch, MissionRun, Segment, Simulation, with_clock, without_clock
+from swarmsim.vehicles.state import RigidState
+from swarmsim.world.build import grouped
+from swarmsim.world.model import World
+
+
+@dataclass(frozen=True)
+class LiveStep:
+    """What a judging period brought."""
+
+    time_s: float  # of the mission, at its beginning
+    command: Any  # full command of the vehicle's policy then (`swarmsim.control.commands`), as arrays of numpy
+    decided: bool  # whether a decision period has ended with it
+    begins: tuple[str, ...]  # phases that are to begin: `LiveMission.begin_phases`
+    over: bool  # whether the mission has ended
+    in_phase: bool  # whether the vehicle is in a phase that it has not done
+
+
+class LiveMission:
+    """One mission whose vehicle ``name`` is flown outside.
+
+    Call `prepare`, then `start`, then `step` once in each ``period_s`` of real time; begin the phases that it names.
+    """
+
+    def __init__(self, simulation: Simulation, seed: int, name: str, progress: Progress | None = None):
+        """Compile nothing yet; raises `InputError` where the mission has no such vehicle."""
+        names = [member.name for member in simulation.scenario.members]
+        if name not in names:
+            raise InputError.of("the mission has no such vehicle", given=name, allowed=", ".join(names))
+        self._simulation, self._seed, self._tell = simulation, seed, progress or SilentProgress()
+        groups = grouped(simulation.scenario)
+        number = names.index(name)
+        group = next(k for k, members in enumerate(groups) if number in members)
+        self.seat = Seat(group=group, local=groups[group].index(number))
+        self.kind = simulation.world.groups[group].kind
+        self._draws, self._batch, worlds, plans = simulation.alone(seed)
+        self._inputs = (worlds, plans)
+        self._run = MissionRun(self._batch, worlds, plans, simulation.plan, self._tell)
+        self._keys = self._batch.put(randomness.mission_keys(np.array([seed])))
+        self._timing = simulation.world.timing
+        self.period_s = self._timing.judge_period_s
+        self._mission: MissionState
+
+    def prepare(self) -> None:
+        """Load or compile all programs, and run each of them once: no setpoint then waits for a compiler."""
+        self.start()
+        phases = range(len(self._simulation.plan.phases))
+        self._batch.prepare([self._run.beginning(n, self._mission, 0, np.zeros(1, bool)) for n in phases])
+        for number in phases:  # for no mission
+            self._mission = self._batch.run(**self._run.beginning(number, self._mission, 0, np.zeros(1, bool)))
+        self.start()
+        self.begin_phases(())
+        body = self.body()
+        for _ in range(self._timing.decision_ticks // self._timing.judge_ticks):
+            self.step(body, 1.0)
+        self.join(body, 0.0)
+        self.start()
+
+    def start(self) -> None:
+        """The beginning of the mission: every vehicle at rest at its start, the phases due not begun."""
+        self._tick = 0
+        self._records: list[np.ndarray] = []
+        self._segments: list[Segment] = []
+        self._mission, signals = self._run.reset(self._keys)
+        self._due = np.flatnonzero(np.asarray(signals.begin)[0])
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the mission began."""
+        return self._tick * self._timing.control_period_s
+
+    def begin_phases(self, numbers: Sequence[int] | None = None) -> tuple[str, ...]:
+        """Begin the phases that are due, and return their names; one that estimates a source takes seconds."""
+        begun = []
+        for number in self._due if numbers is None else numbers:
+            self._mission = self._batch.run(
+                **self._run.beginning(int(number), self._mission, self._tick, np.ones(1, bool))
+            )
+            begun.append(self._simulation.plan.phases[number].name)
+        self._due = np.array([], int) if numbers is None else self._due
+        return tuple(begun)
+
+    def body(self) -> RigidState:
+        """Pose and twist of the vehicle in the mission, as arrays of numpy."""
+        k, body = self.seat.local, self._mission.world.groups[self.seat.group].vehicle.body
+        return jax.tree.map(lambda x: np.asarray(x)[0, k], body)
+
+    def path_m(self) -> np.ndarray | None:
+        """The path [P, 3] of the phase that the vehicle is in, if that follows one."""
+        number = int(np.asarray(self._mission.phase_of[self.seat.group])[0, self.seat.local])
+        if number < 0 or self._mission.phases[number].path is None:
+            return None
+        for place in self._simulation.plan.phases[number].places:
+            if place.group == self.seat.group and self.seat.local in place.local:
+                rank = place.rank[place.local.index(self.seat.local)]
+                return np.asarray(self._mission.phases[number].path.points_m)[0, rank]  # type: ignore[union-attr]
+        return None
+
+    def step(self, body: RigidState, battery: float) -> LiveStep:
+        """The mission one judging period later, with the vehicle where it was measured (``body``)."""
+        measured = jax.tree.map(partial(np.asarray, dtype=np.float32), Measured(body=body, battery=battery))
+        before = self.time_s
+        self._mission, record, command, inside = self._batch.run(
+            "live step", partial(_step, self.seat.group, self.seat.local), self._inputs, self._mission,
+            (measured, np.int32(self._tick)), donate=True,
+        )  # fmt: skip
+        self._tick += self._timing.judge_ticks
+        self._records.append(np.asarray(record)[0])
+        over, begins = False, tuple[str, ...]()
+        ended = self._tick % self._timing.decision_ticks == 0
+        if ended:
+            rows, self._records = np.stack(self._records), []
+            self._mission, log, signals = self._batch.run(
+                "live decision", _decide, self._inputs, self._mission, (rows, np.int32(self._tick)), donate=True
+            )
+            self._segments.append(Segment(log=jax.tree.map(lambda x: np.asarray(x)[:, None], log), periods=1))
+            over, self._due = bool(np.asarray(signals.over)[0]), np.flatnonzero(np.asarray(signals.begin)[0])
+            begins = tuple(self._simulation.plan.phases[number].name for number in self._due)
+        return LiveStep(
+            time_s=before,
+            command=jax.tree.map(lambda x: np.asarray(x)[0], command),
+            decided=ended,
+            begins=begins,
+            over=over,
+            in_phase=bool(np.asarray(inside)[0]),
+        )
+
+    def join(self, body: RigidState, within_m: float) -> None:
+        """Let the vehicle's references go on from where its paths pass ``body``, within that length of their begin."""
+        self._mission = self._batch.run(
+            "live join", partial(_join, self.seat.group, self.seat.local), self._inputs, self._mission,
+            (np.asarray(body.position_m, np.float32), np.float32(within_m), np.int32(self._tick)), donate=True,
+        )  # fmt: skip
+
+    def leave(self) -> None:
+        """The vehicle has no further part in the mission; the rest of the team goes on."""
+        self._mission = self._batch.run(
+            "live leave", partial(_leave, self.seat.group, self.seat.local), self._inputs, self._mission,
+            (np.int32(self._tick),), donate=True,
+        )  # fmt: skip
+
+    def result(self) -> MissionBatch:
+        """What was flown so far, as of a rollout."""
+        end = self._mission
+        if not np.isfinite(np.asarray(end.over_s)).all():
+            end = jax.tree.map(lambda x: x, end)
+            object.__setattr__(end, "over_s", np.full(1, self.time_s, np.float32))
+        return MissionBatch(
+            seeds=np.array([self._seed]),
+            worlds=self._inputs[0],
+            plans=self._inputs[1],
+            end=end,
+            segments=tuple(self._segments),
+            conclusion=self._run.conclude(end, self._keys),
+            clock=self._simulation.clock.copy(),
+            draws=self._draws,
+        )
+
+
+def _running(world: World) -> jax.Array:
+    return jnp.ones(len(world.groups), bool)
+
+
+def _step(
+    group: int, local: int, world: World, plan: Plan, mission: MissionState, measured: Measured, tick: jax.Array
+) -> tuple[MissionState, jax.Array, Any, jax.Array]:
+    seat = Seat(group=group, local=local)
+    mission, record, command = external_frame(
+        world, plan, with_clock(mission, tick, _running(world)), seat, measured
+    )  # fmt: skip
+    inside = mission.phase_of[group][local] >= 0
+    for number, phase in enumerate(plan.phases):
+        for place in phase.places:
+            if place.group == group and local in place.local:
+                done = jnp.isfinite(mission.phases[number].done_s[place.rank[place.local.index(local)]])
+                inside = inside & ~(done & (mission.phase_of[group][local] == number))
+    return without_clock(mission), record, command, inside
+
+
+def _decide(
+    world: World, plan: Plan, mission: MissionState, record: jax.Array, tick: jax.Array
+) -> tuple[MissionState, Any, Signals]:
+    mission, log, signals = decided(world, plan, with_clock(mission, tick, _running(world)), record)
+    return without_clock(mission), log, signals
+
+
+def _join(
+    group: int, local: int, world: World, plan: Plan, mission: MissionState,
+    position_m: jax.Array, within_m: jax.Array, tick: jax.Array,
+) -> MissionState:  # fmt: skip
+    mission = with_clock(mission, tick, _running(world))
+    return without_clock(joined(plan, mission, Seat(group=group, local=local), position_m, within_m))
+
+
+def _leave(
+    group: int, local: int, world: World, plan: Plan, mission: MissionState, tick: jax.Array
+) -> MissionState:  # fmt: skip
+    mission = with_clock(mission, tick, _running(world))
+    return without_clock(lost(world, mission, Seat(group=group, local=local)))
