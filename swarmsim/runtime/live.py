@@ -1,7 +1,7 @@
 """A mission in real time with one of its vehicles outside: a judging period at a time, its pose in, its command out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -157,12 +157,19 @@ class LiveMission:
             (np.int32(self._tick),), donate=True,
         )  # fmt: skip
 
+    def over_without_vehicle(self) -> bool:
+        """Whether every phase that has begun and not ended has no other vehicle than this one, and none is to come."""
+        others = False
+        for phase, state in zip(self._simulation.plan.phases, self._mission.phases, strict=True):
+            ended = np.isfinite(np.asarray(state.ended_s)[0])
+            alone = all(place.group == self.seat.group and place.local == (self.seat.local,) for place in phase.places)
+            others = others or (not ended and not alone)
+        return not others
+
     def result(self) -> MissionBatch:
         """What was flown so far, as of a rollout."""
-        end = self._mission
-        if not np.isfinite(np.asarray(end.over_s)).all():
-            end = jax.tree.map(lambda x: x, end)
-            object.__setattr__(end, "over_s", np.full(1, self.time_s, np.float32))
+        end, over_s = self._mission, np.asarray(self._mission.over_s)
+        end = replace(end, over_s=jnp.where(np.isfinite(over_s), over_s, np.float32(self.time_s)))
         return MissionBatch(
             seeds=np.array([self._seed]),
             worlds=self._inputs[0],

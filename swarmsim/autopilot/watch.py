@@ -1,0 +1,65 @@
+"""What ends a vehicle's part in the mission: the operator, the vehicle's own failsafes, and what we watch ourselves."""
+
+import time
+from dataclasses import dataclass
+from enum import Enum
+
+from swarmsim.autopilot.link import Mode, Telemetry
+from swarmsim.config.autopilot import Watchdogs
+
+
+class Action(Enum):
+    """What we do about it."""
+
+    RELEASE = "release"  # send nothing more: somebody else flies
+    HOLD = "hold"
+    END = "end"  # land or return, as the settings say
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Something that ends the mission's command of the vehicle."""
+
+    action: Action
+    reason: str  # a sentence
+    takeover: bool = False  # by the operator, who may give it back
+
+
+@dataclass
+class Watch:
+    """Judges telemetry while the vehicle follows setpoints."""
+
+    limits: Watchdogs
+
+    def check(self, t: Telemetry, now_s: float | None = None) -> Alarm | None:
+        """What is wrong now, the gravest first; None if nothing is."""
+        now = time.monotonic() if now_s is None else now_s
+        silent = None if t.heard_s is None else now - t.heard_s
+        if silent is None or silent > self.limits.heartbeat_s:
+            since = "no heartbeat came" if silent is None else f"no heartbeat came for {silent:.1f} s"
+            return Alarm(Action.END, f"{since}: the link is lost, and the autopilot's own failsafe has to act")
+        if t.armed is False:
+            return Alarm(Action.RELEASE, "the vehicle was disarmed though we had not asked for it")
+        changed = self.mode_changed(t)
+        if changed is not None:
+            return changed
+        if t.pose_s is None or now - t.pose_s > self.limits.position_s:
+            return Alarm(
+                Action.END, "no position came although heartbeats do: check the GNSS receiver and the estimate"
+            )
+        if t.estimate_ok is False:
+            return Alarm(Action.END, "the autopilot's state estimate has failed")
+        if t.battery is not None and t.battery < self.limits.battery:
+            return Alarm(
+                Action.END,
+                f"the battery is at {100 * t.battery:.0f} %, watchdogs.battery is {100 * self.limits.battery:.0f} %",
+            )
+        return None
+
+    def mode_changed(self, t: Telemetry) -> Alarm | None:
+        """The alarm if the vehicle no longer follows setpoints."""
+        if t.mode is Mode.FOLLOW:
+            return None
+        if t.failsafe:
+            return Alarm(Action.RELEASE, f"a failsafe of the autopilot acts, it is in mode {t.mode_name}")
+        return Alarm(Action.RELEASE, f"the operator took over with mode {t.mode_name}", takeover=True)

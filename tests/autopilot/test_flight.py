@@ -1,0 +1,165 @@
+"""A flight's stages, and every way in which it may end, on a vehicle without dynamics and without MAVLink."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import swarmsim
+from swarmsim.autopilot.flight import Flight
+from swarmsim.autopilot.flown import report
+from swarmsim.autopilot.link import LinkError, Mode
+from swarmsim.config.autopilot import Autopilot, Watchdogs
+from swarmsim.runtime.live import LiveMission
+from tests.autopilot.fake_link import FakeLink
+
+SURVEY = [
+    "engine=analytic", "mapping=null", "localisation=null", "identification=null",
+    "phases=[{name: survey, who: [uav1], policy: waypoints, "
+    "settings: {points: [[-70, -42], [-66, -42]], speed_m_s: 4.0, altitude_m: 6.0}, time_limit_s: 60.0}]",
+]  # fmt: skip
+QUICK = Autopilot(
+    take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=10.0, land_s=20.0,
+    watchdogs=Watchdogs(heartbeat_s=0.5, position_s=0.3, stale_s=0.5, hold_s=0.1),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def live():
+    simulation = swarmsim.build(swarmsim.load("recon", SURVEY))
+    mission = LiveMission(simulation, 0, "uav1")
+    mission.prepare()
+    return mission
+
+
+def flown(live, link, settings=QUICK, during=None):
+    """The flight, and the error that ended it, if one did."""
+    live.start()
+    outline = np.array([[-100.0, -100.0], [100.0, -100.0], [100.0, 100.0], [-100.0, 100.0]])
+    told: list[str] = []
+    flight = Flight(link, live, settings, outline, link.flies, told.append)
+    link.on_change(flight.on_telemetry)
+    if during is not None:
+        threading.Thread(target=during, args=(flight, link), daemon=True).start()
+    error = None
+    try:
+        flight.fly()
+    except LinkError as found:
+        error = found
+    finally:
+        link.close()
+    return flight, error, told
+
+
+def reached(flight, link, stage="mission", seconds=1.0):
+    """Wait until the flight has been in a stage for a while."""
+    deadline = time.monotonic() + 30.0
+    while stage not in [what for _, what in flight.log.events]:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(seconds)
+
+
+@pytest.mark.parametrize("streams_first", [True, False])
+def test_a_vehicle_flies_its_part_and_lands(live, streams_first):
+    link = FakeLink(streams_first=streams_first)
+    flight, error, _ = flown(live, link)
+    assert error is None
+    expected = ["preflight", "follow", "arm"] + ([] if streams_first else ["take_off"])
+    assert link.asked[: len(expected)] == expected
+    assert link.asked[-1] == "land"
+    assert not link.armed
+    summary = report(flight.log, flight.stream.gaps_s(), link.identity, "uav1", None)
+    assert summary["ended"] == "as planned"
+    assert summary["cross_track"]["samples"] > 10
+    assert summary["cross_track"]["rms_m"] < 0.5
+    assert summary["stream"]["gap_max_s"] < 0.5
+    positions = np.array([s.position_m for _, s in link.sent if s.position_m is not None])
+    assert np.ptp(positions[:, 0]) > 3.5
+
+
+def test_setpoints_stop_at_once_when_the_operator_takes_over(live):
+    link, when = FakeLink(), []
+
+    def operator(flight, link):
+        reached(flight, link)
+        when.append(time.monotonic())
+        link.change(Mode.OTHER)
+        when.append(time.monotonic())
+
+    flight, error, _ = flown(live, link, during=operator)
+    assert error is None
+    assert "operator" in flight.log.ended
+    assert flight.takeover_s is not None
+    assert link.sent[-1][0] <= when[1]
+    assert link.asked[-1] == "arm"  # nothing was asked of it afterwards
+    assert link.armed
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason", "last"),
+    [
+        ({"battery": 0.1}, "battery", "land"),
+        ({"estimate": False}, "estimate", "land"),
+        ({"posed": False}, "no position", "land"),
+        ({"heard": False}, "no heartbeat", "land"),
+    ],
+)
+def test_what_the_watchdogs_see_ends_the_flight(live, fault, reason, last):
+    link = FakeLink()
+
+    def fail(flight, link):
+        reached(flight, link)
+        vars(link).update(fault)
+
+    flight, error, _ = flown(live, link, during=fail)
+    assert error is None
+    assert reason in flight.log.ended
+    assert link.asked[-1] == last
+
+
+@pytest.mark.parametrize(("mode", "failsafe", "armed"), [(Mode.RETURN, True, None), (Mode.FOLLOW, False, False)])
+def test_a_vehicle_that_acts_by_itself_is_left_alone(live, mode, failsafe, armed):
+    link = FakeLink()
+
+    def fail(flight, link):
+        reached(flight, link)
+        link.change(mode, failsafe=failsafe, armed=armed)
+
+    flight, error, _ = flown(live, link, during=fail)
+    assert error is None
+    assert ("failsafe" if failsafe else "disarmed") in flight.log.ended
+    assert link.asked[-1] == "arm"
+
+
+@pytest.mark.parametrize("refused", ["preflight", "follow", "arm", "take_off"])
+def test_a_refusal_ends_the_flight_on_the_ground(live, refused):
+    link = FakeLink(streams_first=False)
+    link.refuse = {refused}
+    _, error, _ = flown(live, link)
+    assert error is not None
+    assert refused in str(error)
+    assert not link.sent
+
+
+def test_a_link_that_fails_in_flight_asks_for_landing(live):
+    link = FakeLink()
+
+    def fail(flight, link):
+        reached(flight, link)
+        link.refuse = {"send"}
+
+    flight, error, _ = flown(live, link, during=fail)
+    assert error is None
+    assert "could not be sent" in flight.log.ended
+    assert link.asked[-1] == "land"
+
+
+def test_a_vehicle_under_way_is_not_taken(live):
+    link = FakeLink()
+    link.armed, link.place = True, np.array([0.0, 0.0, 5.0])
+    _, error, _ = flown(live, link)
+    assert error is not None
+    assert "--recover" in str(error)
+    assert link.asked == []
