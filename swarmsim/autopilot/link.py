@@ -89,6 +89,9 @@ class VehicleLink(Protocol):
     def telemetry(self) -> Telemetry:
         """The latest that is known; any thread may ask."""
 
+    def on_mode(self, callback: Callable[[Telemetry], None]) -> None:
+        """Have ``callback`` called at once, by the thread that reads, when the mode or the arming changes."""
+
     def align(self, world_m: Vector) -> None:
         """From now on the place where the vehicle is now is ``world_m`` in the mission's world."""
 

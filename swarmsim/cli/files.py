@@ -23,6 +23,9 @@ from swarmsim.config.load import load_all, load_named
 from swarmsim.config.names import one_of
 
 
+AUTOPILOTS = "autopilots"  # folder of what is known of real ones and their stand-ins
+
+
 def check_files(paths: Sequence[Path]) -> None:
     """Validate every file, say which are right, and raise one `InputError` with the problems of all the others."""
     if not paths:
@@ -47,6 +50,8 @@ def check_files(paths: Sequence[Path]) -> None:
 
 def check_file(path: Path) -> tuple[str, list[str]]:
     """Validate one file with all that it refers to; what it is, and warnings of it. Raises `InputError`."""
+    if path.absolute().parent.name == AUTOPILOTS:
+        return _check_autopilot(path), []
     kind = kind_of_file(path)
     warnings: list[str] = []
     if kind == "missions":
@@ -69,6 +74,17 @@ def check_file(path: Path) -> tuple[str, list[str]]:
     else:
         load_named(kind, path)
     return kind.removesuffix("s"), warnings
+
+
+def _check_autopilot(path: Path) -> str:
+    """Validate what is known of an autopilot, or how one is stood in for; what it is."""
+    from swarmsim.autopilot.mavlink.profile import Autopilot
+    from swarmsim.autopilot.standin.settings import Settings
+    from swarmsim.config.load import load_model
+
+    stand_in = path.stem.startswith("standin_")
+    load_model(path, Settings if stand_in else Autopilot)
+    return "stand-in autopilot" if stand_in else "autopilot"
 
 
 def print_draws(name: str, seed: int | None, missions: int, overrides: Sequence[str]) -> None:

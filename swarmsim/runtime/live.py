@@ -101,7 +101,7 @@ class LiveMission:
     def body(self) -> RigidState:
         """Pose and twist of the vehicle in the mission, as arrays of numpy."""
         k, body = self.seat.local, self._mission.world.groups[self.seat.group].vehicle.body
-        return jax.tree.map(lambda x: np.asarray(x)[0, k], body)
+        return jax.tree.map(lambda x: np.array(x)[0, k], body)  # a copy: the next step takes the arrays over
 
     def path_m(self) -> np.ndarray | None:
         """The path [P, 3] of the phase that the vehicle is in, if that follows one."""
@@ -111,7 +111,7 @@ class LiveMission:
         for place in self._simulation.plan.phases[number].places:
             if place.group == self.seat.group and self.seat.local in place.local:
                 rank = place.rank[place.local.index(self.seat.local)]
-                return np.asarray(self._mission.phases[number].path.points_m)[0, rank]  # type: ignore[union-attr]
+                return np.array(self._mission.phases[number].path.points_m)[0, rank]  # type: ignore[union-attr]
         return None
 
     def step(self, body: RigidState, battery: float) -> LiveStep:
@@ -119,7 +119,7 @@ class LiveMission:
         measured = jax.tree.map(partial(np.asarray, dtype=np.float32), Measured(body=body, battery=battery))
         before = self.time_s
         self._mission, record, command, inside = self._batch.run(
-            "live step", partial(_step, self.seat.group, self.seat.local), self._inputs, self._mission,
+            self._of_seat("live step"), partial(_step, self.seat.group, self.seat.local), self._inputs, self._mission,
             (measured, np.int32(self._tick)), donate=True,
         )  # fmt: skip
         self._tick += self._timing.judge_ticks
@@ -146,14 +146,14 @@ class LiveMission:
     def join(self, body: RigidState, within_m: float) -> None:
         """Let the vehicle's references go on from where its paths pass ``body``, within that length of their begin."""
         self._mission = self._batch.run(
-            "live join", partial(_join, self.seat.group, self.seat.local), self._inputs, self._mission,
+            self._of_seat("live join"), partial(_join, self.seat.group, self.seat.local), self._inputs, self._mission,
             (np.asarray(body.position_m, np.float32), np.float32(within_m), np.int32(self._tick)), donate=True,
         )  # fmt: skip
 
     def leave(self) -> None:
         """The vehicle has no further part in the mission; the rest of the team goes on."""
         self._mission = self._batch.run(
-            "live leave", partial(_leave, self.seat.group, self.seat.local), self._inputs, self._mission,
+            self._of_seat("live leave"), partial(_leave, self.seat.group, self.seat.local), self._inputs, self._mission,
             (np.int32(self._tick),), donate=True,
         )  # fmt: skip
 
@@ -165,6 +165,10 @@ class LiveMission:
             alone = all(place.group == self.seat.group and place.local == (self.seat.local,) for place in phase.places)
             others = others or (not ended and not alone)
         return not others
+
+    def _of_seat(self, name: str) -> str:
+        """The name of a program that is made for this vehicle: a batch tells its programs apart by their names."""
+        return f"{name} {self.seat.group} {self.seat.local}"
 
     def result(self) -> MissionBatch:
         """What was flown so far, as of a rollout."""

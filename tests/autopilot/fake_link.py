@@ -30,7 +30,7 @@ class FakeLink:
         self._heard_s = self._posed_s = time.monotonic()
         threading.Thread(target=self._run, daemon=True).start()
 
-    def on_change(self, tell: Callable[[Telemetry], None]) -> None:
+    def on_mode(self, tell: Callable[[Telemetry], None]) -> None:
         self._tell = tell
 
     def telemetry(self) -> Telemetry:

@@ -39,7 +39,7 @@ def flown(live, link, settings=QUICK, during=None):
     outline = np.array([[-100.0, -100.0], [100.0, -100.0], [100.0, 100.0], [-100.0, 100.0]])
     told: list[str] = []
     flight = Flight(link, live, settings, outline, link.flies, told.append)
-    link.on_change(flight.on_telemetry)
+    link.on_mode(flight.on_telemetry)
     if during is not None:
         threading.Thread(target=during, args=(flight, link), daemon=True).start()
     error = None

@@ -1,0 +1,73 @@
+"""Numbers of the stand-in autopilot: those of ``configs/autopilots/standin_*.yaml``."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from swarmsim.config.base import Delay, Duration, Length, Model, Name, Speed, Vec2
+from swarmsim.config.documents import read_file
+from swarmsim.config.errors import InputError
+from swarmsim.config.files import config_dirs, is_file
+from swarmsim.config.validation import validate
+
+Kind = Literal["px4", "ardupilot"]
+KINDS: tuple[Kind, ...] = ("px4", "ardupilot")
+Rate = Annotated[float, Field(gt=0, le=200)]  # Hz
+
+
+class Origin(Model):
+    """Where the origin of the mission's site lies on the Earth."""
+
+    latitude_deg: float = Field(ge=-89, le=89)
+    longitude_deg: float = Field(ge=-180, le=180)
+    altitude_m: float = Field(ge=-500, le=9000)
+
+
+class DefaultVehicle(Model):
+    """The vehicle that stands in where no mission is given."""
+
+    site: Name
+    type: Name
+    position_m: Vec2
+
+
+class Setpoints(Model):
+    """How setpoints are followed: what PX4 asks of their stream, and ArduPilot's time-out of velocities."""
+
+    stream_s: Delay
+    failsafe_s: Delay
+    timeout_s: Duration | None
+
+
+class Settings(Model):
+    """One kind of autopilot. A whole number among the ``parameters`` is an integer parameter."""
+
+    autopilot: Kind
+    step_s: float = Field(ge=0.005, le=0.1)
+    ready_s: Delay
+    origin: Origin
+    default: DefaultVehicle
+    version: tuple[int, int, int]
+    take_off_speed_m_s: Speed
+    land_speed_m_s: Speed
+    land_speed_high_m_s: Speed
+    land_low_m: Length
+    return_speed_m_s: Speed
+    arrived_m: Length
+    gps_coast_s: Delay
+    streams: dict[str, Rate]
+    status_text: bool
+    setpoint: Setpoints
+    parameters: dict[str, int | float]
+
+
+def load_settings(kind: str) -> Settings:
+    """Settings of ``px4`` or ``ardupilot``, from the working folder's ``configs`` or the shipped ones."""
+    if kind not in KINDS:
+        raise InputError.of(f"there is no autopilot '{kind}'", given=kind, allowed=" or ".join(KINDS))
+    for folder in config_dirs():
+        file = folder / "autopilots" / f"standin_{kind}.yaml"
+        if is_file(file):
+            settings: Settings = validate(read_file(file), Settings)
+            return settings
+    raise InputError.of(f"the settings of the stand-in are missing: autopilots/standin_{kind}.yaml")

@@ -1,0 +1,256 @@
+"""What ``swarmsim fly`` does."""
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from swarmsim.config.errors import InputError
+
+if TYPE_CHECKING:
+    from swarmsim.autopilot.guard import Guard
+    from swarmsim.autopilot.link import VehicleLink
+    from swarmsim.config.scenario import Scenario
+    from swarmsim.runtime.live import LiveMission
+    from swarmsim.runtime.simulation import Simulation
+
+EXIT_FLIGHT = 4  # the vehicle or the link did not do what the flight needed
+SWITCH_S = 0.0005  # Python's threads take turns this often: the stream must not wait for the mission
+ROWS = 30  # of the table of a dry run
+TLOG = "flight.tlog"
+
+
+def fly_mission(
+    name: str,
+    vehicle: str,
+    link: str,
+    profile: str,
+    system: int | None,
+    seed: int | None,
+    overrides: Sequence[str],
+    out: Path | None,
+    force: bool,
+    signing_key: Path | None,
+    recover: str | None,
+    dry_run: bool,
+) -> int:
+    """Fly a vehicle of the mission on a real autopilot, or tell what would be sent; the exit code."""
+    from swarmsim.config.scenario import load_scenario
+    from swarmsim.results.out_folder import check_out
+
+    scenario = load_scenario(name, overrides, seed)
+    names = [member.name for member in scenario.members]
+    if vehicle not in names:
+        raise InputError.of(
+            "the mission has no such vehicle", path="--vehicle", given=vehicle, allowed=", ".join(names)
+        )
+    console = Console()
+    if recover is not None:
+        return _recovered(link, profile, system, signing_key, recover, scenario, console)
+    if dry_run:
+        return _rehearsed(scenario, vehicle, console)
+    folder = out if out is not None else Path("runs") / f"{scenario.mission.name}_{vehicle}"
+    check_out(folder, force)
+    return _flown(scenario, vehicle, link, profile, system, signing_key, folder, force, console)
+
+
+def _recovered(
+    link: str, profile: str, system: int | None, key: Path | None, how: str, scenario: "Scenario", console: Console
+) -> int:
+    """Have a vehicle that is under way land or return, whoever left it there."""
+    from swarmsim.autopilot.link import LinkError, Mode
+    from swarmsim.autopilot.mavlink import MavlinkVehicle
+
+    settings = scenario.mission.autopilot
+    try:
+        vehicle = MavlinkVehicle(link, autopilot=profile, system=system, key_file=key)
+        try:
+            vehicle.enter(Mode.LAND if how == "land" else Mode.RETURN, settings.answer_s)
+            console.print(f"it does: {how}")
+            end = time.monotonic() + settings.land_s
+            while vehicle.telemetry().armed:
+                if time.monotonic() > end:
+                    raise LinkError(f"it is still armed after {settings.land_s:g} s (autopilot.land_s)")
+                time.sleep(0.2)
+            console.print("it stands, disarmed")
+        finally:
+            vehicle.close()
+    except LinkError as error:
+        return _failed(error)
+    return 0
+
+
+def _built(scenario: "Scenario", vehicle: str) -> "tuple[Simulation, LiveMission]":
+    from swarmsim.runtime.devices import use_all_cores
+    from swarmsim.runtime.live import LiveMission
+    from swarmsim.runtime.run import build
+
+    use_all_cores()
+    simulation = build(scenario)
+    return simulation, LiveMission(simulation, scenario.mission.seed, vehicle)
+
+
+def _prepared(live: "LiveMission", console: Console) -> None:
+    with console.status("load or compile the mission's programs"):
+        live.prepare()
+
+
+def _flies(live: "LiveMission") -> bool:
+    from swarmsim.world.kinds import KINDS
+
+    return bool(KINDS[live.kind].FLIES)
+
+
+def outline_of(simulation: "Simulation") -> np.ndarray:
+    """Corners [4, 2] of the site, counter-clockwise, world."""
+    site = simulation.site_model.site
+    low = np.asarray(site.origin_m, np.float64)
+    rows, columns = np.shape(site.terrain_m)
+    high = low + float(site.cell_m) * (np.array([columns, rows]) - 1)
+    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+
+
+def _guard(simulation: "Simulation", live: "LiveMission", scenario: "Scenario") -> "Guard":
+    from swarmsim.autopilot.guard import Guard
+
+    return Guard(
+        limits=scenario.mission.autopilot.limits,
+        outline_m=outline_of(simulation),
+        ground_m=float(live.body().position_m[2]),
+        flies=_flies(live),
+    )
+
+
+def _rehearsed(scenario: "Scenario", vehicle: str, console: Console) -> int:
+    """Print the setpoints that a flight would send, as a table and on a map."""
+    from swarmsim.autopilot.link import LinkError
+    from swarmsim.autopilot.rehearsal import cells, drawn, picked, rehearse
+
+    simulation, live = _built(scenario, vehicle)
+    _prepared(live, console)
+    guard = _guard(simulation, live, scenario)
+    limit = float(sum(phase.time_limit_s for phase in scenario.mission.phases))
+    try:
+        rows = rehearse(live, guard, limit)
+    except LinkError as error:
+        return _failed(error)
+    columns = ("time s", "position ENU m", "velocity ENU m/s", "position NED m", "heading deg", "refused")
+    table = Table(title=f"{vehicle}: setpoints that would be sent", title_justify="left")
+    for column in columns:
+        table.add_column(column, no_wrap=column != "refused")
+    for row in picked(rows, ROWS):
+        table.add_row(*map(escape, cells(row)))
+    console.print(table)
+    console.print(drawn(rows, outline_of(simulation)), markup=False, highlight=False)
+    refused = sum(bool(row.refused) for row in rows)
+    console.print(f"{len(rows)} setpoints, {refused} refused by autopilot.limits; nothing was sent", highlight=False)
+    return 0 if rows and not refused else EXIT_FLIGHT
+
+
+def _flown(
+    scenario: "Scenario", name: str, link: str, profile: str, system: int | None, key: Path | None, folder: Path,
+    force: bool, console: Console,
+) -> int:  # fmt: skip
+    from swarmsim.atomic_folder import claimed
+    from swarmsim.autopilot.flight import Flight
+    from swarmsim.autopilot.link import LinkError
+    from swarmsim.autopilot.mavlink import MavlinkVehicle
+
+    simulation, live = _built(scenario, name)
+    sys.setswitchinterval(SWITCH_S)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    log = folder.parent / f"{folder.name}.tlog"  # whatever happens, what was said stays
+
+    def tell(text: str) -> None:
+        console.print(escape(text), highlight=False)
+
+    with claimed(folder):
+        try:
+            vehicle = MavlinkVehicle(link, autopilot=profile, system=system, log=log, key_file=key)
+        except LinkError as error:
+            return _failed(error)
+        try:
+            known = vehicle.identity
+            tell(f"{known.autopilot} {known.vehicle} {known.version}, system {known.system}")
+            flies = _flies(live)
+            if (known.vehicle == "rover") == flies:
+                raise InputError.of(
+                    "the vehicle of the mission and that on the link are of different kinds",
+                    given=f"{name} {'flies' if flies else 'drives'}, the link has a {known.vehicle}",
+                )
+            _prepared(live, console)
+            flight = Flight(vehicle, live, scenario.mission.autopilot, outline_of(simulation), flies, tell)
+            vehicle.on_mode(flight.on_telemetry)
+            code, stopped = _outcome(flight)
+        finally:
+            vehicle.close()
+        if flight.log.rows:
+            _write(simulation, live, flight, vehicle, name, folder, log, force, console)
+    if stopped is not None:
+        raise stopped
+    return code
+
+
+def _outcome(flight: Any) -> tuple[int, KeyboardInterrupt | None]:
+    """The exit code of a flight, and what stopped it."""
+    from swarmsim.autopilot.link import LinkError
+
+    try:
+        flight.fly()
+    except LinkError as error:
+        flight.log.event(str(error))
+        flight.log.ended = flight.log.ended or str(error)
+        return _failed(error), None
+    except KeyboardInterrupt as stop:
+        flight.log.ended = flight.log.ended or "stopped by the user"
+        return 0, stop
+    return EXIT_FLIGHT if flight.log.ended else 0, None
+
+
+def _write(
+    simulation: "Simulation", live: "LiveMission", flight: Any, vehicle: "VehicleLink", name: str, folder: Path,
+    log: Path, force: bool, console: Console,
+) -> None:  # fmt: skip
+    from swarmsim.autopilot import flown
+    from swarmsim.results.extract import mission_record
+    from swarmsim.results.run_directory import write_run
+    from swarmsim.runtime.run import timings_of
+
+    summary = flown.report(flight.log, flight.stream.gaps_s(), vehicle.identity, name, flight.takeover_s)
+    with console.status("estimate and write"):
+        batch = live.result()
+        if batch.segments:
+            write_run(simulation, (mission_record(simulation, batch, 0),), folder, timings_of(batch), force=force)
+        folder.mkdir(parents=True, exist_ok=True)
+        flown.write(folder, flight.log, summary)
+        log.replace(folder / TLOG)
+    _print_summary(summary, console.print)
+    console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
+
+
+def _print_summary(summary: dict[str, Any], print_: Callable[..., None]) -> None:
+    table = Table("flight", "value", title_justify="left")
+    table.add_row("Ended", escape(summary["ended"]))
+    stream, track = summary["stream"], summary["cross_track"]
+    table.add_row("Setpoints sent", f"{stream['setpoints']:,}")
+    for label, value, unit in (
+        ("Gap between setpoints, 99.9th percentile", stream["gap_p99.9_s"], "s"),
+        ("Gap between setpoints, greatest", stream["gap_max_s"], "s"),
+        ("Horizontal error on the lines, rms", track["rms_m"], "m"),
+        ("Horizontal error on the lines, greatest", track["max_m"], "m"),
+        ("Takeover seen to last setpoint", summary["takeover_to_silence_s"], "s"),
+    ):
+        if value is not None:
+            table.add_row(label, f"{value:.3f} {unit}")
+    print_(table)
+
+
+def _failed(error: Exception) -> int:
+    sys.stderr.write(f"{error}\n")
+    return EXIT_FLIGHT
