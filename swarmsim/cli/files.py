@@ -22,7 +22,6 @@ from swarmsim.config.errors import InputError, Problem, file_errors_told, raise_
 from swarmsim.config.load import load_all, load_named
 from swarmsim.config.names import one_of
 
-
 AUTOPILOTS = "autopilots"  # folder of what is known of real ones and their stand-ins
 
 
