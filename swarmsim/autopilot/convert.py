@@ -1,27 +1,23 @@
 """From what a policy commands to what is sent to a vehicle, and from telemetry to a body of the mission."""
 
-import math
 from typing import Any
 
 import numpy as np
 
 from swarmsim.autopilot.link import LinkError, Setpoint, Telemetry, Vector
-from swarmsim.control.commands import DRIVE, DRIVE_TO, POSITION, MultirotorCommand, PositionCommand, SkidSteerCommand
+from swarmsim.control.commands import DRIVE, POSITION, MultirotorCommand, PositionCommand, SkidSteerCommand
 from swarmsim.vehicles.state import RigidState
 
-ARRIVED_M = 0.05  # a rover this close to the point that it pursues stands
 
+def setpoint_of(command: Any) -> Setpoint:
+    """The setpoint of a command that `swarmsim.missions.external.command_of` gives.
 
-def setpoint_of(command: Any, telemetry: Telemetry) -> Setpoint:
-    """The setpoint of a full command (`swarmsim.control.commands`), of a vehicle with that telemetry.
-
-    A rover that pursues a point is sent the velocity towards it: autopilots stop at a position as soon as they are
-    within their waypoint radius, metres away. Raises `LinkError` for levels that no autopilot takes from outside.
+    Raises `LinkError` for levels that no autopilot takes from outside.
     """
     if isinstance(command, MultirotorCommand | PositionCommand):
         return _of_multirotor(command)
     if isinstance(command, SkidSteerCommand):
-        return _of_rover(command, telemetry)
+        return _of_rover(command)
     raise LinkError(f"a {type(command).__name__} cannot be sent to a vehicle")
 
 
@@ -40,25 +36,17 @@ def _of_multirotor(command: MultirotorCommand | PositionCommand) -> Setpoint:
     )
 
 
-def _of_rover(command: SkidSteerCommand, telemetry: Telemetry) -> Setpoint:
-    level = int(command.level)
-    if level == DRIVE_TO:
-        if telemetry.position_m is None:
-            raise LinkError("the rover has not told where it is: check its GNSS receiver and its state estimate")
-        east, north = (float(a) - b for a, b in zip(command.position_m, telemetry.position_m, strict=False))
-        distance = math.hypot(east, north)
-        share = float(command.speed_m_s) / distance if distance > ARRIVED_M else 0.0
-        return Setpoint(velocity_m_s=(share * east, share * north, 0.0))
-    if level == DRIVE:
-        ahead, turn = float(command.speed_m_s), float(command.yaw_rate_rad_s)
-        return Setpoint(velocity_m_s=(ahead, 0.0, 0.0), yaw_rate_rad_s=turn, body=True)
-    raise LinkError("the policy commands wheel speeds: a real rover is driven by velocities; choose another policy")
+def _of_rover(command: SkidSteerCommand) -> Setpoint:
+    if int(command.level) != DRIVE:
+        raise LinkError("the policy commands wheel speeds: a real rover is driven by velocities; choose another policy")
+    ahead, turn = float(command.speed_m_s), float(command.yaw_rate_rad_s)
+    return Setpoint(velocity_m_s=(ahead, 0.0, 0.0), yaw_rate_rad_s=turn, body=True)
 
 
 def hold_at(telemetry: Telemetry, flies: bool) -> Setpoint:
     """The setpoint that keeps a vehicle where it is."""
     if not flies:
-        return Setpoint(velocity_m_s=(0.0, 0.0, 0.0))
+        return Setpoint(velocity_m_s=(0.0, 0.0, 0.0), yaw_rate_rad_s=0.0, body=True)
     assert telemetry.position_m is not None
     return Setpoint(position_m=telemetry.position_m, velocity_m_s=(0.0, 0.0, 0.0))
 

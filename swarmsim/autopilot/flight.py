@@ -204,7 +204,7 @@ class Flight:
         if not step.in_phase and not step.begins:
             self._end(self.settings.at_end)
             return
-        setpoint = setpoint_of(step.command, t)
+        setpoint = setpoint_of(step.command)
         self.log.row(step.time_s, setpoint, t, self.live.path_m)
         if self._descends(setpoint, t):
             self._end("land")
@@ -244,6 +244,7 @@ class Flight:
 
     def _end(self, how: str) -> None:
         """Leave setpoints for the autopilot's own mode; setpoints stop when it is in it."""
+        how = how if self.flies or how == "return" else "hold"
         self._stage(how)
         self._enter(_MODES[how])
         self._flown_s, self._lands_itself = time.monotonic(), self.flies and how != "hold"

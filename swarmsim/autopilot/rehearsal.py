@@ -8,7 +8,7 @@ import numpy as np
 from swarmsim.autopilot.convert import setpoint_of
 from swarmsim.autopilot.frames import ned_of_enu, yaw_ned_of_enu
 from swarmsim.autopilot.guard import Guard, RefusedError
-from swarmsim.autopilot.link import Setpoint, Telemetry
+from swarmsim.autopilot.link import Setpoint
 from swarmsim.runtime.live import LiveMission
 
 
@@ -38,7 +38,7 @@ def rehearse(live: LiveMission, guard: Guard, limit_s: float) -> list[Sent]:
         step = live.step(body, 1.0)
         flown = flown or (bool(rows) and not step.in_phase and not step.begins)
         if not flown and step.in_phase:
-            setpoint, refused = setpoint_of(step.command, Telemetry(position_m=place)), ""  # type: ignore[arg-type]
+            setpoint, refused = setpoint_of(step.command), ""
             try:
                 guard.check(setpoint, step.time_s)
             except RefusedError as error:

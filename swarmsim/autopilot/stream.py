@@ -1,5 +1,7 @@
 """The stream of setpoints: a thread of its own, so that nothing the mission computes delays it."""
 
+import contextlib
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -8,6 +10,8 @@ import numpy as np
 
 from swarmsim.autopilot.guard import Guard, RefusedError
 from swarmsim.autopilot.link import Setpoint
+
+PRIORITY = -10  # nice value of the thread; it needs a few microseconds in each period
 
 
 class SetpointStream:
@@ -78,6 +82,8 @@ class SetpointStream:
         return gaps[np.isfinite(gaps)]
 
     def _run(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # where the system lets it, before what only computes
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), PRIORITY)
         due = time.monotonic()
         while not self._over.wait(max(0.0, due - time.monotonic())):
             try:

@@ -1,5 +1,6 @@
 """What ``swarmsim fly`` does."""
 
+import gc
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -187,8 +188,13 @@ def _flown(
             _prepared(live, console)
             flight = Flight(vehicle, live, scenario.mission.autopilot, outline_of(simulation), flies, tell)
             vehicle.on_mode(flight.on_telemetry)
+            # a collection of the garbage among all that was compiled would stop the stream for half a second
+            gc.collect()
+            gc.freeze()
+            gc.disable()
             code, stopped = _outcome(flight)
         finally:
+            gc.enable()
             vehicle.close()
         if flight.log.rows:
             _write(simulation, live, flight, vehicle, name, folder, log, force, console)

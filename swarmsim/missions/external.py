@@ -10,6 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from swarmsim.control.commands import DRIVE, DRIVE_TO, SkidSteerCommand
+from swarmsim.control.skid_steer import pursue
 from swarmsim.missions.acting import (
     TASK_AXES,
     VIEW_AXES,
@@ -96,7 +98,10 @@ def with_measured(world: World, mission: MissionState, seat: Seat, measured: Mea
 
 
 def command_of(world: World, plan: Plan, mission: MissionState, seat: Seat) -> Any:
-    """The full command that the vehicle's policy gives at the beginning of the judging period."""
+    """The full command that the vehicle's policy gives at the beginning of the judging period.
+
+    A rover's is a speed and a yaw rate, or wheel speeds: autopilots end a pursuit metres before the point pursued.
+    """
     seen, _ = look_around(world, mission.world, mission.world.clock.tick // world.timing.judge_ticks)
     mission = replace(mission, world=seen)
     mission = replace(mission, phases=ask(world, plan, mission))
@@ -119,7 +124,20 @@ def command_of(world: World, plan: Plan, mission: MissionState, seat: Seat) -> A
             command = rows(every, (here,))
         given.append((mission.phase_of[seat.group][seat.local] == number, jax.tree.map(lambda x: x[0], command)))
     params, vehicle = jax.tree.map(lambda x: x[seat.local], (group.params, state.vehicle))
-    return chosen(group, params, vehicle, given)
+    command = chosen(group, params, vehicle, given)
+    return _driven(params, vehicle, command) if isinstance(command, SkidSteerCommand) else command
+
+
+def _driven(params: Any, vehicle: Any, command: SkidSteerCommand) -> SkidSteerCommand:
+    """The command with a pursuit as the speed and the turn that our own controller makes of it."""
+    speed, turn = pursue(params, vehicle, command.position_m, command.speed_m_s)
+    pursues = command.level == DRIVE_TO
+    return replace(
+        command,
+        level=jnp.where(pursues, DRIVE, command.level),
+        speed_m_s=jnp.where(pursues, jnp.maximum(speed, 0.0), command.speed_m_s),
+        yaw_rate_rad_s=jnp.where(pursues, turn, command.yaw_rate_rad_s),
+    )
 
 
 def joined(plan: Plan, mission: MissionState, seat: Seat, here: jax.Array, within_m: jax.Array) -> MissionState:
