@@ -73,12 +73,7 @@ class Flight:
     def fly(self) -> None:
         """From preflight to the end; raises `LinkError` where the vehicle does not do what is needed."""
         self._stage("preflight")
-        t = self.link.telemetry()
-        if t.armed and (not self.flies or t.on_ground is False):
-            raise LinkError(
-                "the vehicle is armed and under way: another program or an earlier flight of this one may command it. "
-                "Land it (swarmsim fly --recover land, or the operator), then start again"
-            )
+        refuse_under_way(self.link)
         self.link.preflight(self._tell, self.settings.ready_s)
         self.link.align(self._rest)  # type: ignore[arg-type]
         self.live.start()
@@ -280,6 +275,15 @@ class Flight:
                 self._alarm = alarm
 
 
+def refuse_under_way(link: VehicleLink) -> None:
+    """Raise `LinkError` if the vehicle is armed: somebody flies it, or a flight of ours was interrupted."""
+    if link.telemetry().armed:
+        raise LinkError(
+            "the vehicle is armed: somebody else flies it, or an earlier flight was interrupted. Have it disarmed (the "
+            "operator, or swarmsim fly MISSION --vehicle NAME --recover land), then start again"
+        )
+
+
 def _told(link: VehicleLink) -> str:
     messages = link.messages()
     return "it says: " + " / ".join(messages[-5:]) if messages else "it has not said why"
@@ -290,4 +294,4 @@ def _heading(quaternion: Any) -> tuple[float, float]:
     return 2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)
 
 
-__all__ = ["Flight"]
+__all__ = ["Flight", "refuse_under_way"]

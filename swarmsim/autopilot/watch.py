@@ -44,8 +44,10 @@ class Watch:
         if changed is not None:
             return changed
         if t.pose_s is None or now - t.pose_s > self.limits.position_s:
+            since = "no position came" if t.pose_s is None else f"no position came for {now - t.pose_s:.1f} s"
             return Alarm(
-                Action.END, "no position came although heartbeats do: check the GNSS receiver and the estimate"
+                Action.END,
+                f"{since}, the last heartbeat {silent:.1f} s ago: check the link, the GNSS receiver and the estimate",
             )
         if t.estimate_ok is False:
             return Alarm(Action.END, "the autopilot's state estimate has failed")

@@ -159,7 +159,7 @@ def _flown(
     force: bool, console: Console,
 ) -> int:  # fmt: skip
     from swarmsim.atomic_folder import claimed
-    from swarmsim.autopilot.flight import Flight
+    from swarmsim.autopilot.flight import Flight, refuse_under_way
     from swarmsim.autopilot.link import LinkError
     from swarmsim.autopilot.mavlink import MavlinkVehicle
 
@@ -176,6 +176,9 @@ def _flown(
             vehicle = MavlinkVehicle(link, autopilot=profile, system=system, log=log, key_file=key)
         except LinkError as error:
             return _failed(error)
+        stopped: KeyboardInterrupt | None = None
+        flight: Flight | None = None
+        code = EXIT_FLIGHT
         try:
             known = vehicle.identity
             tell(f"{known.autopilot} {known.vehicle} {known.version}, system {known.system}")
@@ -185,6 +188,7 @@ def _flown(
                     "the vehicle of the mission and that on the link are of different kinds",
                     given=f"{name} {'flies' if flies else 'drives'}, the link has a {known.vehicle}",
                 )
+            refuse_under_way(vehicle)
             _prepared(live, console)
             flight = Flight(vehicle, live, scenario.mission.autopilot, outline_of(simulation), flies, tell)
             vehicle.on_mode(flight.on_telemetry)
@@ -193,10 +197,12 @@ def _flown(
             gc.freeze()
             gc.disable()
             code, stopped = _outcome(flight)
+        except LinkError as error:
+            _failed(error)
         finally:
             gc.enable()
             vehicle.close()
-        if flight.log.rows:
+        if flight is not None and flight.log.rows:
             _write(simulation, live, flight, vehicle, name, folder, log, force, console)
     if stopped is not None:
         raise stopped
