@@ -396,8 +396,8 @@ def fly(
         swarmsim fly recon --vehicle uav1 --link serial:/dev/ttyUSB0:57600 --profile ardupilot
         swarmsim fly recon --vehicle uav1 --recover land
 
-    How it flies (limits, watchdogs, what a takeover and the end mean) stands under 'autopilot' in the mission. Ctrl-C
-    ends the flight as autopilot.at_end says.
+    How it flies (limits, watchdogs, what it does at the end) stands under 'autopilot' in the mission. Ctrl-C ends the
+    flight as autopilot.at_end says. An operator who changes the mode takes over for good.
 
     Parameters
     ----------

@@ -42,15 +42,13 @@ class Watchdogs(Model):
 class Autopilot(Model):
     """How a vehicle is flown on a real autopilot.
 
-    ``at_end``: what it does when its part of the mission has ended in the air, and on Ctrl-C. ``on_takeover``: when
-    the operator changes its mode we stop commanding at once; ``resume`` goes on with the mission when the operator
-    changes it back, ``stop`` never does.
+    ``at_end``: what it does when its part of the mission has ended in the air, and on Ctrl-C. When the operator changes
+    its mode we stop commanding at once, for good.
     """
 
     stream_hz: float = Field(default=20.0, ge=5, le=100)
     take_off_m: float = Field(default=3.0, ge=0.5, le=100)
     at_end: Literal["land", "hold", "return"] = "land"
-    on_takeover: Literal["stop", "resume"] = "stop"
     ready_s: Duration = 120.0
     answer_s: Duration = 5.0
     take_off_s: Duration = 60.0
