@@ -16,6 +16,7 @@ from swarmsim.autopilot.standin.settings import load_settings
 from swarmsim.autopilot.standin.sockets import open_link
 from swarmsim.autopilot.standin.vehicle import Standin
 from swarmsim.cli.entry import main
+from tests.autopilot.ports import free_port
 
 BLOCK = """
 name: block
@@ -34,12 +35,6 @@ phases:
   - {name: drive, who: rover, policy: waypoints, settings: {points: [[-64, -50]], speed_m_s: 0.9}, time_limit_s: 40}
 autopilot: {take_off_m: 2.0, ready_s: 20, watchdogs: {heartbeat_s: 2.5}}
 """
-
-
-def free_port(kind: int) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from swarmsim.autopilot.mavlink.transport import LinkAddress, parse_link
 from swarmsim.autopilot.mavlink.wire import Protocol, is_unknown, origin_of, read_key
 from swarmsim.config.errors import InputError
 from tests.autopilot import test_mavlink_peer as peers
+from tests.autopilot.ports import free_port
 from tests.autopilot.test_mavlink_peer import eventually
 
 KEY = bytes(range(32))
@@ -95,7 +96,7 @@ def test_links_that_cannot_be_opened():
 def test_a_log_that_cannot_be_written(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="log cannot be written"):
-        Connection(f"udpin:{peers.free_port()}", print, log=tmp_path / "file" / "flight.tlog")
+        Connection(f"udpin:{free_port()}", print, log=tmp_path / "file" / "flight.tlog")
 
 
 # bytes
@@ -153,7 +154,7 @@ def test_messages_of_unknown_kinds_count_but_are_not_taken():
 
 @given(st.lists(st.binary(min_size=1, max_size=300), min_size=1, max_size=15))
 def test_a_vehicle_is_flown_through_junk(junk):
-    port = peers.free_port()
+    port = free_port()
     heard: list = []
     connection = Connection(f"udpin:{port}", heard.append)
     try:
@@ -170,7 +171,7 @@ def test_a_vehicle_is_flown_through_junk(junk):
 
 
 def test_losses_are_counted_by_the_sequence_number():
-    port = peers.free_port()
+    port = free_port()
     connection = Connection(f"udpin:{port}", lambda message: None)
     try:
         connection.select(7, 1)
@@ -237,7 +238,7 @@ def test_signatures_are_not_guessed(seed):
 
 def test_a_vehicle_that_signs(tmp_path):
     (tmp_path / "key").write_text(KEY.hex())
-    port = peers.free_port()
+    port = free_port()
     with peers.peer_on(port, key=KEY) as peer:
         vehicle = MavlinkVehicle(f"udpin:{port}", system=7, key_file=tmp_path / "key")
         try:
@@ -251,7 +252,7 @@ def test_a_vehicle_that_signs(tmp_path):
 
 def test_a_vehicle_with_another_key(tmp_path):
     (tmp_path / "key").write_text(secrets.token_hex())
-    port = peers.free_port()
+    port = free_port()
     with peers.peer_on(port, key=KEY), pytest.raises(LinkError, match=r"no valid heartbeat(.|\n)*signing key"):
         MavlinkVehicle(f"udpin:{port}", system=7, key_file=tmp_path / "key", timeout_s=0.5)
 
@@ -277,7 +278,7 @@ def test_a_tcp_link_comes_back():
 
 
 def test_a_link_that_waits_for_tcp():
-    port, heard = peers.free_port(), []
+    port, heard = free_port(), []
     connection = Connection(f"tcpin:{port}", heard.append)
     try:
         for round_ in (1, 2):

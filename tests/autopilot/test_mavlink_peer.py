@@ -15,12 +15,6 @@ TICK_S = 0.02
 PREARM = mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 class Peer:
     """Tells its state every 20 ms and answers commands; what it does wrong is set by its fields."""
 

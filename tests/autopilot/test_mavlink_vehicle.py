@@ -13,6 +13,7 @@ from swarmsim.autopilot.mavlink import MavlinkVehicle
 from swarmsim.autopilot.mavlink.vehicle import moves
 from swarmsim.config.errors import InputError
 from tests.autopilot import test_mavlink_peer as peers
+from tests.autopilot.ports import free_port
 from tests.autopilot.test_mavlink_peer import ARDUPILOT, COPTER, LOITER, POSITION, PX4, ROVER, Peer, eventually
 
 SET_MODE, ARM, TAKEOFF = 176, 400, 22
@@ -24,7 +25,7 @@ def linked():
     opened = []
 
     def link(how=None, wanted=None) -> tuple[Peer, MavlinkVehicle]:
-        port = peers.free_port()
+        port = free_port()
         peer = Peer(port, **(how or {}))
         opened.append(peer)
         vehicle = MavlinkVehicle(f"udpin:127.0.0.1:{port}", **{"system": 7, "timeout_s": 5.0, **(wanted or {})})
@@ -65,7 +66,7 @@ def test_the_vehicle_is_found(linked, autopilot, kind, names):
 
 
 def test_another_vehicle_than_expected_is_refused():
-    port = peers.free_port()
+    port = free_port()
     with (
         peers.peer_on(port, autopilot=ARDUPILOT, kind=ROVER),
         pytest.raises(LinkError, match="is ardupilot rover, not px4 copter"),
@@ -74,24 +75,24 @@ def test_another_vehicle_than_expected_is_refused():
 
 
 def test_a_vehicle_of_an_unknown_kind_is_refused():
-    port = peers.free_port()
+    port = free_port()
     with peers.peer_on(port, kind=1), pytest.raises(LinkError, match="MAV_TYPE 1"):
         MavlinkVehicle(f"udpin:127.0.0.1:{port}", system=7)
 
 
 def test_a_silent_port():
     with pytest.raises(LinkError, match="nothing at all"):
-        MavlinkVehicle(f"udpin:127.0.0.1:{peers.free_port()}", timeout_s=0.2)
+        MavlinkVehicle(f"udpin:127.0.0.1:{free_port()}", timeout_s=0.2)
 
 
 def test_the_wrong_system():
-    port = peers.free_port()
+    port = free_port()
     with peers.peer_on(port), pytest.raises(LinkError, match="heard: system 7 component 1"):
         MavlinkVehicle(f"udpin:127.0.0.1:{port}", system=3, timeout_s=0.5)
 
 
 def test_two_vehicles_on_one_port_must_be_told_apart():
-    port = peers.free_port()
+    port = free_port()
     with (
         peers.peer_on(port, system=1),
         peers.peer_on(port, system=2),

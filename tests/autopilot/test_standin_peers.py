@@ -16,14 +16,9 @@ from swarmsim.autopilot.standin.kinematic import KinematicBody
 from swarmsim.autopilot.standin.settings import load_settings
 from swarmsim.autopilot.standin.sockets import open_link
 from swarmsim.autopilot.standin.vehicle import Standin
+from tests.autopilot.ports import free_port
 
 SPEED = 3.0
-
-
-def free_port(kind: int) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def mavsdk_system():
