@@ -147,7 +147,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "fragment"),
     [
-        (["fly"], 'Unknown command "fly"'),
+        (["soar"], 'Unknown command "soar"'),
         (["run"], "requires an argument"),
         (["run", "recon", "--sed", "1"], "Did you mean --seed?"),
         (["run", "recon", "--seed", "one"], "a whole number is needed, not 'one'"),
