@@ -220,7 +220,7 @@ class _Serial:
     """A serial port, opened anew when the device was unplugged and comes back."""
 
     def __init__(self, address: LinkAddress):
-        import serial  # pyserial comes with pymavlink; only this kind of link needs it
+        import serial
 
         self._port = serial.Serial(address.host, address.number, timeout=0.05, write_timeout=0.5)
         self._closed = False

@@ -1,0 +1,114 @@
+"""Commands that speak to autopilots."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from swarmsim.cli.app import SEED_END, command, whole
+
+
+@command
+def fly(
+    scenario: str,
+    *,
+    vehicle: str,
+    link: str = "udpin:127.0.0.1:14540",
+    profile: Literal["px4", "ardupilot", "auto"] = "auto",
+    system: Annotated[int | None, Parameter(validator=Number(gte=1, lte=255), converter=whole)] = None,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END), converter=whole)] = None,
+    out: Path | None = None,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    signing_key: Path | None = None,
+    recover: Literal["land", "return"] | None = None,
+    dry_run: bool = False,
+    force: bool = False,
+) -> int:
+    """Fly one vehicle of a mission on a real autopilot, PX4 or ArduPilot; the others are simulated around it.
+
+    For example:
+        swarmsim fly recon --vehicle uav1 --dry-run
+        swarmsim fly recon --vehicle uav1 --link udpin:127.0.0.1:14540
+        swarmsim fly recon --vehicle uav1 --link serial:/dev/ttyUSB0:57600 --profile ardupilot
+        swarmsim fly recon --vehicle uav1 --recover land
+
+    How it flies (limits, watchdogs, what it does at the end) stands under 'autopilot' in the mission. Ctrl-C ends the
+    flight as autopilot.at_end says. An operator who changes the mode takes over for good.
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission, or a mission file.
+    vehicle
+        Name of the vehicle in the mission.
+    link
+        Where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or
+        serial:DEVICE:BAUD.
+    profile
+        Which autopilot it is; auto (the default) takes what it says of itself.
+    system
+        System id of the vehicle, where several are on the link.
+    seed
+        Seed of the mission, in the stead of its own.
+    out
+        Folder of the results; runs/NAME_VEHICLE by default.
+    overrides
+        Change a value of the mission, as path=value; may be given again and again.
+    signing_key
+        File with the 32 bytes of a MAVLink 2 signing key.
+    recover
+        Fly no mission: have a vehicle that is under way land or return, and wait until it stands.
+    dry_run
+        Send nothing: print the setpoints that would be sent, as a table and on a map.
+    force
+        Replace earlier results.
+    """
+    from swarmsim.cli.fly import fly_mission
+
+    return fly_mission(
+        scenario, vehicle, link, profile, system, seed, overrides, out, force, signing_key, recover, dry_run
+    )
+
+
+@command(name="autopilot-sim")
+def autopilot_sim(
+    scenario: str | None = None,
+    *,
+    vehicle: str | None = None,
+    autopilot: Literal["px4", "ardupilot"] = "px4",
+    link: str | None = None,
+    system: Annotated[int, Parameter(name="--sysid", validator=Number(gte=1, lte=255), converter=whole)] = 1,
+    speed: Annotated[float, Parameter(validator=Number(gte=0.1, lte=100))] = 1.0,
+    seed: Annotated[int, Parameter(validator=Number(gte=0, lt=SEED_END), converter=whole)] = 0,
+) -> int:
+    """Stand in for a real autopilot: a MAVLink vehicle that behaves as PX4 or ArduPilot do, over swarmsim's physics.
+
+    For example:
+        swarmsim autopilot-sim
+        swarmsim autopilot-sim recon --vehicle uav1 --autopilot px4 --link udpout:127.0.0.1:14540
+        swarmsim autopilot-sim recon --vehicle orpheus --autopilot ardupilot --link tcpin:127.0.0.1:5760
+
+    It runs until Ctrl-C. Fly it with 'swarmsim fly', or from any ground station.
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission, or a mission file, with the vehicle; without one a vehicle on level ground.
+    vehicle
+        Name of the vehicle in the mission; the first one by default.
+    autopilot
+        Whose behaviour it has; px4 by default.
+    link
+        Where it offers its link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; by default that of the
+        autopilot's own simulation.
+    system
+        Its system id; 1 by default.
+    speed
+        Simulated seconds in a second; 1 by default.
+    seed
+        Of its wind and noise.
+    """
+    from swarmsim.cli.autopilot_sim import run_stand_in
+
+    return run_stand_in(scenario, vehicle, autopilot, link, system, speed, seed)
