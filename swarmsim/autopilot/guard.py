@@ -7,12 +7,19 @@ import numpy as np
 
 from swarmsim.autopilot.link import Setpoint, Vector
 from swarmsim.config.autopilot import SetpointLimits
+from swarmsim.site.model import Site, bounds_m
 
 ROUNDING = 1.001  # a command at a limit may exceed it by float32's rounding
 
 
 class RefusedError(ValueError):
     """A setpoint that must not be sent; the message says why."""
+
+
+def outline_of(site: Site) -> np.ndarray:
+    """Corners [4, 2] of a site, counter-clockwise, world: where positions may lie."""
+    (west, south), (east, north) = (np.asarray(corner, np.float64) for corner in bounds_m(site))
+    return np.array([[west, south], [east, south], [east, north], [west, north]])
 
 
 @dataclass

@@ -107,6 +107,9 @@ class VehicleLink(Protocol):
     def arm(self, timeout_s: float) -> None:
         """Arm, confirmed by the vehicle's state."""
 
+    def disarm(self, timeout_s: float) -> None:
+        """Disarm a vehicle that stands, confirmed by its state; in the air it refuses."""
+
     def take_off(self, height_m: float, timeout_s: float) -> None:
         """Climb to ``height_m`` above where it stands, where the autopilot needs a command for that; else nothing."""
 

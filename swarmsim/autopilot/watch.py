@@ -22,7 +22,7 @@ class Alarm:
 
     action: Action
     reason: str  # a sentence
-    takeover: bool = False  # by the operator, who may give it back
+    takeover: bool = False  # by the operator
 
 
 @dataclass
@@ -38,9 +38,7 @@ class Watch:
         if silent is None or silent > self.limits.heartbeat_s:
             since = "no heartbeat came" if silent is None else f"no heartbeat came for {silent:.1f} s"
             return Alarm(Action.END, f"{since}: the link is lost, and the autopilot's own failsafe has to act")
-        if t.armed is False:
-            return Alarm(Action.RELEASE, "the vehicle was disarmed though we had not asked for it")
-        changed = self.mode_changed(t)
+        changed = self.disarmed(t) or self.mode_changed(t)
         if changed is not None:
             return changed
         if t.pose_s is None or now - t.pose_s > self.limits.position_s:
@@ -57,6 +55,12 @@ class Watch:
                 f"the battery is at {100 * t.battery:.0f} %, watchdogs.battery is {100 * self.limits.battery:.0f} %",
             )
         return None
+
+    def disarmed(self, t: Telemetry) -> Alarm | None:
+        """The alarm if the vehicle is no longer armed."""
+        if t.armed is not False:
+            return None
+        return Alarm(Action.RELEASE, "the vehicle was disarmed though we had not asked for it")
 
     def mode_changed(self, t: Telemetry) -> Alarm | None:
         """The alarm if the vehicle no longer follows setpoints."""

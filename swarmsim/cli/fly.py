@@ -2,12 +2,11 @@
 
 import gc
 import sys
-import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -65,21 +64,14 @@ def _recovered(
     link: str, profile: str, system: int | None, key: Path | None, how: str, scenario: "Scenario", console: Console
 ) -> int:
     """Have a vehicle that is under way land or return, whoever left it there."""
-    from swarmsim.autopilot.link import LinkError, Mode
+    from swarmsim.autopilot.control import recover
+    from swarmsim.autopilot.link import LinkError
     from swarmsim.autopilot.mavlink import MavlinkVehicle
 
-    settings = scenario.mission.autopilot
     try:
         vehicle = MavlinkVehicle(link, autopilot=profile, system=system, key_file=key)
         try:
-            vehicle.enter(Mode.LAND if how == "land" else Mode.RETURN, settings.answer_s)
-            console.print(f"it does: {how}")
-            end = time.monotonic() + settings.land_s
-            while vehicle.telemetry().armed:
-                if time.monotonic() > end:
-                    raise LinkError(f"it is still armed after {settings.land_s:g} s (autopilot.land_s)")
-                time.sleep(0.2)
-            console.print("it stands, disarmed")
+            recover(vehicle, how, scenario.mission.autopilot, partial(console.print, highlight=False))
         finally:
             vehicle.close()
     except LinkError as error:
@@ -94,7 +86,10 @@ def _built(scenario: "Scenario", vehicle: str) -> "tuple[Simulation, LiveMission
 
     use_all_cores()
     simulation = build(scenario)
-    return simulation, LiveMission(simulation, scenario.mission.seed, vehicle)
+    live = LiveMission(simulation, scenario.mission.seed, vehicle)
+    if not live.has_part:
+        raise InputError.of("the vehicle has no part in the mission: no phase names it under 'who'", given=vehicle)
+    return simulation, live
 
 
 def _prepared(live: "LiveMission", console: Console) -> None:
@@ -108,21 +103,12 @@ def _flies(live: "LiveMission") -> bool:
     return bool(KINDS[live.kind].FLIES)
 
 
-def outline_of(simulation: "Simulation") -> np.ndarray:
-    """Corners [4, 2] of the site, counter-clockwise, world."""
-    site = simulation.site_model.site
-    low = np.asarray(site.origin_m, np.float64)
-    rows, columns = np.shape(site.terrain_m)
-    high = low + float(site.cell_m) * (np.array([columns, rows]) - 1)
-    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
-
-
 def _guard(simulation: "Simulation", live: "LiveMission", scenario: "Scenario") -> "Guard":
-    from swarmsim.autopilot.guard import Guard
+    from swarmsim.autopilot.guard import Guard, outline_of
 
     return Guard(
         limits=scenario.mission.autopilot.limits,
-        outline_m=outline_of(simulation),
+        outline_m=outline_of(simulation.site_model.site),
         ground_m=float(live.body().position_m[2]),
         flies=_flies(live),
     )
@@ -148,7 +134,7 @@ def _rehearsed(scenario: "Scenario", vehicle: str, console: Console) -> int:
     for row in picked(rows, ROWS):
         table.add_row(*map(escape, cells(row)))
     console.print(table)
-    console.print(drawn(rows, outline_of(simulation)), markup=False, highlight=False)
+    console.print(drawn(rows, guard.outline_m), markup=False, highlight=False)
     refused = sum(bool(row.refused) for row in rows)
     console.print(f"{len(rows)} setpoints, {refused} refused by autopilot.limits; nothing was sent", highlight=False)
     return 0 if rows and not refused else EXIT_FLIGHT
@@ -159,7 +145,9 @@ def _flown(
     force: bool, console: Console,
 ) -> int:  # fmt: skip
     from swarmsim.atomic_folder import claimed
-    from swarmsim.autopilot.flight import Flight, refuse_under_way
+    from swarmsim.autopilot.control import refuse_under_way
+    from swarmsim.autopilot.flight import Flight
+    from swarmsim.autopilot.guard import outline_of
     from swarmsim.autopilot.link import LinkError
     from swarmsim.autopilot.mavlink import MavlinkVehicle
 
@@ -190,7 +178,8 @@ def _flown(
                 )
             refuse_under_way(vehicle)
             _prepared(live, console)
-            flight = Flight(vehicle, live, scenario.mission.autopilot, outline_of(simulation), flies, tell)
+            outline = outline_of(simulation.site_model.site)
+            flight = Flight(vehicle, live, scenario.mission.autopilot, outline, flies, tell)
             vehicle.on_mode(flight.on_telemetry)
             # a collection of the garbage among all that was compiled would stop the stream for half a second
             gc.collect()
@@ -201,6 +190,7 @@ def _flown(
             _failed(error)
         finally:
             gc.enable()
+            gc.unfreeze()
             vehicle.close()
         if flight is not None and flight.log.rows:
             _write(simulation, live, flight, vehicle, name, folder, log, force, console)
@@ -234,11 +224,15 @@ def _write(
     from swarmsim.results.run_directory import write_run
     from swarmsim.runtime.run import timings_of
 
-    summary = flown.report(flight.log, flight.stream.gaps_s(), vehicle.identity, name, flight.takeover_s)
-    with console.status("estimate and write"):
-        batch = live.result()
-        if batch.segments:
-            write_run(simulation, (mission_record(simulation, batch, 0),), folder, timings_of(batch), force=force)
+    summary = flown.report(
+        flight.log, flight.control.stream.gaps_s(), vehicle.identity, name, flight.control.takeover_s
+    )
+    try:
+        with console.status("estimate and write"):
+            batch = live.result()
+            if batch.segments:
+                write_run(simulation, (mission_record(simulation, batch, 0),), folder, timings_of(batch), force=force)
+    finally:  # what was flown stays, whatever becomes of the estimate
         folder.mkdir(parents=True, exist_ok=True)
         flown.write(folder, flight.log, summary)
         log.replace(folder / TLOG)

@@ -24,6 +24,7 @@ from swarmsim.estimation.fit import (
 from swarmsim.estimation.forward import Problem, Rates, rates, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.pytree import pytree
+from swarmsim.site.model import bounds_m
 
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
 GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
@@ -168,9 +169,6 @@ def best_of(
 
 def bounds(problem: Problem) -> Bounds:
     """Lower and upper bounds [3] of a place."""
-    site = problem.site
-    ny, nx = site.terrain_m.shape
-    extent = site.cell_m * jnp.array([nx - 1, ny - 1], jnp.float32)
     reach = HEIGHT_REACH * jnp.maximum(problem.height_std_m, 1e-3)
-    low, high = site.origin_m, site.origin_m + extent
+    low, high = bounds_m(problem.site)
     return jnp.append(low, problem.height_m - reach), jnp.append(high, problem.height_m + reach)

@@ -147,7 +147,7 @@ def joined(plan: Plan, mission: MissionState, seat: Seat, here: jax.Array, withi
     """
     phases = list(mission.phases)
     for number, phase in enumerate(plan.phases):
-        state, rank = phases[number], _rank(phase, seat)
+        state, rank = phases[number], rank_of(phase, seat)
         if rank is None or state.path is None or not isinstance(state.memory, Progress):
             continue
         path = jax.tree.map(lambda x, rank=rank: x[rank], state.path)
@@ -162,8 +162,8 @@ def _nearest(path: Path, place_m: jax.Array, within_m: jax.Array) -> jax.Array:
     return arc[jnp.argmin(jnp.sum(apart * apart, axis=1))]
 
 
-def _rank(phase: Phase, seat: Seat) -> int | None:
-    """The vehicle's number in the phase."""
+def rank_of(phase: Phase, seat: Seat) -> int | None:
+    """The vehicle's number among those of the phase; None where it has no part in it."""
     for place in phase.places:
         if place.group == seat.group and seat.local in place.local:
             return place.rank[place.local.index(seat.local)]
@@ -175,4 +175,4 @@ def _with_group(mission: MissionState, number: int, group: Any) -> MissionState:
     return replace(mission, world=replace(mission.world, groups=groups))
 
 
-__all__ = ["Measured", "Seat", "command_of", "external_frame", "joined", "lost", "with_measured"]
+__all__ = ["Measured", "Seat", "command_of", "external_frame", "joined", "lost", "rank_of", "with_measured"]

@@ -1,6 +1,5 @@
 """A mission in real time with one of its vehicles outside: a judging period at a time, its pose in, its command out."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from swarmsim import randomness
 from swarmsim.config.errors import InputError
-from swarmsim.missions.external import Measured, Seat, external_frame, joined, lost
+from swarmsim.missions.external import Measured, Seat, external_frame, joined, lost, rank_of
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.segment import decided
 from swarmsim.missions.state import MissionState, Signals
@@ -28,7 +27,6 @@ class LiveStep:
 
     time_s: float  # of the mission, at its beginning
     command: Any  # full command of the vehicle's policy then (`swarmsim.control.commands`), as arrays of numpy
-    decided: bool  # whether a decision period has ended with it
     begins: tuple[str, ...]  # phases that are to begin: `LiveMission.begin_phases`
     over: bool  # whether the mission has ended
     in_phase: bool  # whether the vehicle is in a phase that it has not done
@@ -67,11 +65,11 @@ class LiveMission:
         for number in phases:  # for no mission
             self._mission = self._batch.run(**self._run.beginning(number, self._mission, 0, np.zeros(1, bool)))
         self.start()
-        self.begin_phases(())
         body = self.body()
         for _ in range(self._timing.decision_ticks // self._timing.judge_ticks):
             self.step(body, 1.0)
         self.join(body, 0.0)
+        self.leave()
         self.start()
 
     def start(self) -> None:
@@ -87,16 +85,39 @@ class LiveMission:
         """Simulated time since the mission began."""
         return self._tick * self._timing.control_period_s
 
-    def begin_phases(self, numbers: Sequence[int] | None = None) -> tuple[str, ...]:
+    def begin_phases(self) -> tuple[str, ...]:
         """Begin the phases that are due, and return their names; one that estimates a source takes seconds."""
         begun = []
-        for number in self._due if numbers is None else numbers:
+        for number in self._due:
             self._mission = self._batch.run(
                 **self._run.beginning(int(number), self._mission, self._tick, np.ones(1, bool))
             )
             begun.append(self._simulation.plan.phases[number].name)
-        self._due = np.array([], int) if numbers is None else self._due
+        self._due = np.array([], int)
         return tuple(begun)
+
+    def phase(self) -> int | None:
+        """Number of the phase that the vehicle is in, if its part there is not done."""
+        for number, rank in self._ranks():
+            here = int(np.asarray(self._mission.phase_of[self.seat.group])[0, self.seat.local]) == number
+            if here and np.isinf(np.asarray(self._mission.phases[number].done_s)[0, rank]):
+                return number
+        return None
+
+    @property
+    def has_part(self) -> bool:
+        """Whether any phase has the vehicle."""
+        return bool(self._ranks())
+
+    def has_phase_to_come(self) -> bool:
+        """Whether a phase with the vehicle has not begun yet."""
+        return any(np.isinf(np.asarray(self._mission.phases[number].began_s)[0]) for number, _ in self._ranks())
+
+    def _ranks(self) -> list[tuple[int, int]]:
+        """The phases with the vehicle, and its number in each of them."""
+        seat, phases = self.seat, enumerate(self._simulation.plan.phases)
+        ranks = ((number, rank_of(phase, seat)) for number, phase in phases)
+        return [(number, rank) for number, rank in ranks if rank is not None]
 
     def body(self) -> RigidState:
         """Pose and twist of the vehicle in the mission, as arrays of numpy."""
@@ -108,11 +129,8 @@ class LiveMission:
         number = int(np.asarray(self._mission.phase_of[self.seat.group])[0, self.seat.local])
         if number < 0 or self._mission.phases[number].path is None:
             return None
-        for place in self._simulation.plan.phases[number].places:
-            if place.group == self.seat.group and self.seat.local in place.local:
-                rank = place.rank[place.local.index(self.seat.local)]
-                return np.array(self._mission.phases[number].path.points_m)[0, rank]  # type: ignore[union-attr]
-        return None
+        rank = rank_of(self._simulation.plan.phases[number], self.seat)
+        return None if rank is None else np.array(self._mission.phases[number].path.points_m)[0, rank]  # type: ignore[union-attr]
 
     def step(self, body: RigidState, battery: float) -> LiveStep:
         """The mission one judging period later, with the vehicle where it was measured (``body``)."""
@@ -137,7 +155,6 @@ class LiveMission:
         return LiveStep(
             time_s=before,
             command=jax.tree.map(lambda x: np.asarray(x)[0], command),
-            decided=ended,
             begins=begins,
             over=over,
             in_phase=bool(np.asarray(inside)[0]),
@@ -199,10 +216,10 @@ def _step(
     )  # fmt: skip
     inside = mission.phase_of[group][local] >= 0
     for number, phase in enumerate(plan.phases):
-        for place in phase.places:
-            if place.group == group and local in place.local:
-                done = jnp.isfinite(mission.phases[number].done_s[place.rank[place.local.index(local)]])
-                inside = inside & ~(done & (mission.phase_of[group][local] == number))
+        rank = rank_of(phase, seat)
+        if rank is not None:
+            done = jnp.isfinite(mission.phases[number].done_s[rank])
+            inside = inside & ~(done & (mission.phase_of[group][local] == number))
     return without_clock(mission), record, command, inside
 
 

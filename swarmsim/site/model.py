@@ -135,6 +135,12 @@ def sample_with_gradient(raster: jax.Array, site: Site, xy: jax.Array) -> tuple[
     return south + y * (north - south), jnp.where(inside, slope / _cells_of(site, raster)[1], 0.0)
 
 
+def bounds_m(site: Site) -> tuple[jax.Array, jax.Array]:
+    """South-west and north-east corner [2] of the site: centres of its outermost cells, ENU."""
+    rows, columns = site.terrain_m.shape
+    return site.origin_m, site.origin_m + site.cell_m * (jnp.array([columns, rows]) - 1)
+
+
 def height_at(site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:
     """Height of the terrain [n] at ``xy`` [n, 2] (ENU, m), bilinear as `sample`, on the host."""
     terrain = np.asarray(site.terrain_m, np.float64)

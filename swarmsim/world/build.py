@@ -24,6 +24,7 @@ from swarmsim.radiation.library import Library
 from swarmsim.sensors.radiation import Counter, Departures
 from swarmsim.site import Site, SiteModel
 from swarmsim.site.landing_places import landing_places
+from swarmsim.site.model import bounds_m
 from swarmsim.site.walls import walls_of
 from swarmsim.vehicles.multirotor import multirotor_params
 from swarmsim.vehicles.skid_steer import skid_steer_params
@@ -154,9 +155,7 @@ def surface_factors(site: Site, factors: dict[str, float]) -> np.ndarray:
 
 def _failsafes(scenario: Scenario, site: Site) -> FailsafeRules:
     rules = scenario.mission.failsafes
-    origin = np.asarray(site.origin_m, np.float64)
-    rows, columns = np.shape(site.terrain_m)
-    end = origin + float(site.cell_m) * (np.array([columns, rows]) - 1)
+    origin, end = (np.asarray(corner, np.float64) for corner in bounds_m(site))
     kinds: list[Failsafe] = [rules.fence, rules.wind, rules.battery, rules.link]
     fence, wind, battery, link = (kind.action != "none" for kind in kinds)
     margin = rules.fence.margin_m if fence else -NOWHERE_M

@@ -23,7 +23,7 @@ class FakeLink:
         self.sent: list[tuple[float, Setpoint]] = []
         self.asked: list[str] = []
         self.refuse: set[str] = set()
-        self.ground_m = 0.0
+        self.ground_m, self.sinks_m_s = 0.0, 4.0
         self._goal: Setpoint | None = None
         self._tell: Callable[[Telemetry], None] | None = None
         self._last, self._over = time.monotonic(), threading.Event()
@@ -78,6 +78,10 @@ class FakeLink:
         self._ask("arm")
         self.armed = True
 
+    def disarm(self, timeout_s: float) -> None:
+        self._ask("disarm")
+        self.armed = False
+
     def take_off(self, height_m: float, timeout_s: float) -> None:
         self._ask("take_off")
         self._goal = Setpoint(position_m=tuple(self.place + np.array([0.0, 0.0, height_m])))  # type: ignore[arg-type]
@@ -112,7 +116,7 @@ class FakeLink:
             if not self.armed:
                 continue
             if self.mode in (Mode.LAND, Mode.RETURN):
-                self.velocity = np.array([0.0, 0.0, -4.0])
+                self.velocity = np.array([0.0, 0.0, -self.sinks_m_s])
                 if self.place[2] <= self.ground_m:
                     self.place[2], self.velocity, self.armed = self.ground_m, np.zeros(3), False
             elif goal is not None and goal.position_m is not None:

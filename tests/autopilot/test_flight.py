@@ -25,12 +25,30 @@ QUICK = Autopilot(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def live():
-    simulation = swarmsim.build(swarmsim.load("recon", SURVEY))
+LATE = [
+    *SURVEY[:-1],
+    "phases=[{name: first, who: [uav2], policy: waypoints, "
+    "settings: {points: [[-74, -47]], speed_m_s: 4.0, altitude_m: 3.0}, time_limit_s: 3.0}, "
+    "{name: second, who: [uav1], policy: waypoints, start: {after: first}, "
+    "settings: {points: [[-72, -42]], speed_m_s: 4.0, altitude_m: 4.0}, time_limit_s: 20.0}]",
+]  # fmt: skip
+
+
+def prepared(overrides):
+    simulation = swarmsim.build(swarmsim.load("recon", overrides))
     mission = LiveMission(simulation, 0, "uav1")
     mission.prepare()
     return mission
+
+
+@pytest.fixture(scope="module")
+def live():
+    return prepared(SURVEY)
+
+
+@pytest.fixture(scope="module")
+def late():
+    return prepared(LATE)
 
 
 def flown(live, link, settings=QUICK, during=None):
@@ -70,7 +88,7 @@ def test_a_vehicle_flies_its_part_and_lands(live, streams_first):
     assert link.asked[: len(expected)] == expected
     assert link.asked[-1] == "land"
     assert not link.armed
-    summary = report(flight.log, flight.stream.gaps_s(), link.identity, "uav1", None)
+    summary = report(flight.log, flight.control.stream.gaps_s(), link.identity, "uav1", None)
     assert summary["ended"] == "as planned"
     assert summary["cross_track"]["samples"] > 10
     assert summary["cross_track"]["rms_m"] < 0.5
@@ -91,7 +109,7 @@ def test_setpoints_stop_at_once_when_the_operator_takes_over(live):
     flight, error, _ = flown(live, link, during=operator)
     assert error is None
     assert "operator" in flight.log.ended
-    assert flight.takeover_s is not None
+    assert flight.control.takeover_s is not None
     assert link.sent[-1][0] <= when[1]
     assert link.asked[-1] == "arm"  # nothing was asked of it afterwards
     assert link.armed
@@ -163,3 +181,100 @@ def test_a_vehicle_under_way_is_not_taken(live):
     assert error is not None
     assert "--recover" in str(error)
     assert link.asked == []
+
+
+def test_a_vehicle_whose_phase_begins_later_waits_on_the_ground(late):
+    link, when = FakeLink(), {}
+    flight, error, _ = flown(late, link, during=lambda flight, link: when.update(armed=link.armed))
+    assert error is None
+    assert flight.log.ended == ""
+    events = [what for _, what in flight.log.events]
+    assert events.index("plan second") < events.index("arm") < events.index("mission")
+    assert max(s.position_m[0] for _, s in link.sent if s.position_m is not None) > -72.5
+    assert not link.armed
+
+
+def test_a_takeover_in_the_climb_is_seen_at_once(live):
+    link, when = FakeLink(), []
+    settings = QUICK.model_copy(update={"take_off_m": 50.0})
+
+    def operator(flight, link):
+        reached(flight, link, "take off", 0.5)
+        link.change(Mode.OTHER)
+        when.append(time.monotonic())
+
+    flight, error, _ = flown(live, link, settings, during=operator)
+    assert error is None
+    assert "operator" in flight.log.ended
+    assert link.sent[-1][0] <= when[0]
+    assert link.asked[-1] == "arm"
+
+
+def test_a_takeover_while_it_holds_is_not_overruled(live):
+    link = FakeLink()
+    dogs = QUICK.watchdogs.model_copy(update={"hold_s": 3.0})
+
+    def stall(flight, link):
+        reached(flight, link, seconds=0.3)
+        flight.control._on_stale()
+        reached(flight, link, "hold", 0.5)
+        link.change(Mode.OTHER)
+
+    flight, error, _ = flown(live, link, QUICK.model_copy(update={"watchdogs": dogs}), during=stall)
+    assert error is None
+    assert link.asked[-1] == "hold"
+    assert link.armed
+    assert any("operator" in what for _, what in flight.log.events)
+
+
+def test_a_takeover_while_it_lands_ends_the_wait(live):
+    link = FakeLink()
+    link.sinks_m_s = 0.01
+
+    def operator(flight, link):
+        reached(flight, link, "land", 0.3)
+        link.change(Mode.OTHER)
+
+    flight, error, _ = flown(live, link, during=operator)
+    assert error is None
+    assert "operator" in flight.log.ended
+    assert link.armed
+
+
+def test_a_mode_that_changed_unnoticed_is_not_overruled(live):
+    link = FakeLink()
+
+    def operator(flight, link):
+        reached(flight, link)
+        link.mode = Mode.OTHER  # the callback never comes: telemetry alone shows it
+        link.battery = 0.05
+
+    _, error, _ = flown(live, link, during=operator)
+    assert error is None
+    assert link.asked[-1] == "arm"
+    assert link.armed
+
+
+def test_a_fault_of_our_own_brings_the_vehicle_down(live, monkeypatch):
+    link = FakeLink()
+
+    def broken(*_):
+        raise ZeroDivisionError("a fault in a policy")
+
+    def fail(flight, link):
+        reached(flight, link)
+        monkeypatch.setattr(flight.live, "step", broken)
+
+    with pytest.raises(ZeroDivisionError):
+        flown(live, link, during=fail)
+    assert link.asked[-1] == "request land"
+
+
+def test_a_refused_setpoint_ends_the_flight(live):
+    settings = QUICK.model_copy(update={"limits": QUICK.limits.model_copy(update={"speed_m_s": 1.0})})
+    link = FakeLink()
+    flight, error, _ = flown(live, link, settings)
+    assert error is None
+    assert "limits.speed_m_s" in flight.log.ended
+    assert link.asked[-1] == "land"
+    assert not link.armed

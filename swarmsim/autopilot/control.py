@@ -1,0 +1,308 @@
+"""Control of one vehicle outside: taking it, keeping it, and giving it up, whatever the reason.
+
+Three threads meet here. The link's reader tells of mode changes at once, and an operator's halts the stream before
+anything else; the stream sends setpoints; the thread of the flight arms, watches and ends.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from enum import Enum
+
+import numpy as np
+
+from swarmsim.autopilot.convert import hold_at
+from swarmsim.autopilot.guard import Guard, RefusedError
+from swarmsim.autopilot.link import LinkError, Mode, Setpoint, Telemetry, Vector, VehicleLink
+from swarmsim.autopilot.stream import SetpointStream
+from swarmsim.autopilot.watch import Action, Alarm, Watch
+from swarmsim.config.autopilot import Autopilot
+
+STREAMED_S = 1.5  # of setpoints before a vehicle that asks for them is told to follow (PX4 asks for 1 s)
+CLIMBED = 0.85  # of the height of take-off, from which on the mission flies it
+RESTS_M_S, RESTS_S = 0.1, 3.0  # a rover on its way home has arrived when it has been that slow for so long
+POLL_S = 0.05
+
+_MODES = {"land": Mode.LAND, "hold": Mode.HOLD, "return": Mode.RETURN}
+
+
+class State(Enum):
+    """Who moves the vehicle."""
+
+    STANDS = "stands"  # nobody: it is disarmed, or has not been armed yet
+    STARTS = "starts"  # it is being armed and takes off
+    FOLLOWS = "follows"  # our setpoints
+    ENDS = "ends"  # the autopilot, which lands or returns because we asked for it
+    HOLDS = "holds"  # the autopilot, which holds in the air because we asked for it
+    RELEASED = "released"  # somebody else, for good
+
+
+class Control:
+    """What we may do to one vehicle, and what we do when something is wrong."""
+
+    def __init__(self, link: VehicleLink, settings: Autopilot, guard: Guard, flies: bool, stage: Callable[[str], None]):
+        """``stage`` is told what begins, in a word or a sentence."""
+        self.link, self.settings, self.flies = link, settings, flies
+        self.state = State.STANDS
+        self.alarm: Alarm | None = None
+        self.takeover_s: tuple[float, float] | None = None  # when an operator's was seen, and when the stream halted
+        self.stream = SetpointStream(
+            link.send, guard, settings.stream_hz, settings.watchdogs.stale_s, self._on_stale, self._on_error
+        )
+        self._stage, self._watch = stage, Watch(settings.watchdogs)
+        self._lock = threading.Lock()
+        self._mode: Mode | None = None  # the mode that we brought about; another one is somebody else's
+        self._armed = False  # we armed it
+        self._last: Setpoint | None = None
+        self._ended_s = 0.0  # when the autopilot was asked to end
+
+    # What is seen
+
+    def on_telemetry(self, t: Telemetry) -> None:
+        """Called by the link's reader whenever mode or arming may have changed: a takeover halts the stream here."""
+        if self._mode is not Mode.FOLLOW:
+            return
+        changed = self._watch.disarmed(t) if self._armed else None
+        changed = changed or self._watch.mode_changed(t)
+        if changed is not None:
+            seen = time.monotonic()
+            self._mode = None
+            self.stream.halt()
+            self._halted(changed, seen)
+
+    def _halted(self, alarm: Alarm, seen_s: float) -> None:
+        if alarm.takeover:
+            self.takeover_s = seen_s, time.monotonic()
+        self._raise(alarm)
+
+    def watch(self) -> bool:
+        """Look for what is wrong, and act on it; whether the vehicle is still ours."""
+        t = self.link.telemetry()
+        if self.state in (State.STARTS, State.FOLLOWS):
+            if self._armed:
+                self._raise(self._watch.check(t))
+            if self.alarm is not None:
+                self._handle(self.alarm)
+        return self.alarm is None
+
+    # What is done
+
+    def start(self, above_m: Vector, yaw_rad: float) -> bool:
+        """Arm it, have it take off to ``above_m`` and follow our setpoints; whether it does: else see ``alarm``."""
+        s, link = self.settings, self.link
+        self.state, height = State.STARTS, s.take_off_m
+        above = Setpoint(position_m=above_m, velocity_m_s=(0.0, 0.0, 0.0), yaw_rad=yaw_rad)
+        waiting = above if self.flies else hold_at(link.telemetry(), flies=False)
+        if link.streams_first:
+            self.stream.resume()
+            self.offer(waiting, keep=True)
+            time.sleep(STREAMED_S)
+        self._stage("arm")
+        link.follow(s.answer_s)
+        self._mode = Mode.FOLLOW
+        link.arm(s.answer_s)
+        self._armed = True
+        if self.flies:
+            self._stage("take off")
+            if not link.streams_first:
+                link.take_off(height, s.take_off_s)
+            self._climb(above_m[2] - (1.0 - CLIMBED) * height, above_m[2] - height, s.take_off_s)
+        if self.alarm is None and not link.streams_first:
+            self.stream.resume()
+            self.offer(waiting, keep=True)
+        self.on_telemetry(link.telemetry())
+        if self.watch():
+            self.state = State.FOLLOWS
+        return self.state is State.FOLLOWS
+
+    def _climb(self, height_m: float, ground_m: float, timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while self.watch():
+            t = self.link.telemetry()
+            if t.position_m is not None and t.position_m[2] >= height_m:
+                return
+            if time.monotonic() > deadline:
+                now = "unknown" if t.position_m is None else f"{t.position_m[2] - ground_m:.1f} m"
+                raise LinkError(f"it did not climb within {timeout_s:g} s: its height is {now}; {_told(self.link)}")
+            time.sleep(POLL_S)
+
+    def offer(self, setpoint: Setpoint, *, keep: bool = False) -> None:
+        """Have a setpoint sent from now on; one that must not be sent ends the vehicle's part."""
+        try:
+            self.stream.offer(setpoint, keep=keep)
+            self._last = setpoint
+        except RefusedError as error:
+            self._raise(Alarm(Action.END, f"a setpoint was refused: {error}"))
+
+    def hold(self) -> None:
+        """Hold where it was last told to be, for as long as nothing else is offered."""
+        last, t = self._last, self.link.telemetry()
+        if self.flies and last is not None and last.position_m is not None:
+            self.offer(
+                Setpoint(position_m=last.position_m, velocity_m_s=(0.0, 0.0, 0.0), yaw_rad=last.yaw_rad), keep=True
+            )
+        else:
+            self.offer(hold_at(t, self.flies), keep=True)
+
+    def end(self, how: str) -> None:
+        """Leave setpoints for the autopilot's own land, hold or return; setpoints stop when it is in it."""
+        how = how if self.flies or how == "return" else "hold"
+        self._stage(how)
+        self._enter(_MODES[how])
+        if self.state is not State.RELEASED:
+            self.state = State.HOLDS if self.flies and how == "hold" else State.ENDS
+            self._ended_s = self._slow_s = time.monotonic()
+
+    def stands(self) -> bool:
+        """Whether nothing is left to do: it has landed, holds, or somebody else flies it.
+
+        Raises `LinkError` where it has not landed in time.
+        """
+        if self.state is not State.ENDS:
+            return self.state in (State.STANDS, State.HOLDS, State.RELEASED)
+        t, now = self.link.telemetry(), time.monotonic()
+        if t.armed is False:
+            self._stage("landed" if self.flies else "disarmed")
+            self.state, self._armed, self._mode = State.STANDS, False, None
+            return True
+        if t.mode is not self._mode and not t.failsafe and not self._lands_next(t):
+            self._released(f"the operator took over with mode {t.mode_name}")
+            return True
+        if not self.flies and self._at_rest(t, now):
+            self.link.disarm(self.settings.answer_s)
+            return False
+        if now - self._ended_s > self.settings.land_s:
+            raise LinkError(
+                f"it has not {'landed' if self.flies else 'stopped'} within {self.settings.land_s:g} s "
+                f"(autopilot.land_s); {_told(self.link)}"
+            )
+        return False
+
+    def stop(self) -> None:
+        """The user stops: end as the settings say, and wait until the vehicle stands."""
+        if self.state is State.STARTS and not self.link.telemetry().armed:
+            self.stream.halt()
+            self._mode, self.state = None, State.STANDS
+            self.link.disarm(self.settings.answer_s)  # our command to arm may be on its way
+        elif self.state in (State.STARTS, State.FOLLOWS):
+            self.end(self.settings.at_end)
+        while not self.stands():
+            time.sleep(POLL_S)
+
+    def emergency(self) -> None:
+        """Something failed: in the air, ask for what the settings say without waiting for an answer."""
+        self._mode = None
+        self.stream.halt()
+        t = self.link.telemetry()
+        if t.armed and t.mode is Mode.FOLLOW:
+            how = self.settings.watchdogs.then
+            self._stage(f"asking for {how} because of that")
+            self.link.request(_MODES[how])
+
+    # Inside
+
+    def _lands_next(self, t: Telemetry) -> bool:
+        return self._mode is Mode.RETURN and t.mode is Mode.LAND
+
+    def _at_rest(self, t: Telemetry, now_s: float) -> bool:
+        moves = t.velocity_m_s is None or float(np.hypot(*t.velocity_m_s[:2])) > RESTS_M_S
+        if moves:
+            self._slow_s = now_s
+        return now_s - self._slow_s > (RESTS_S if self._mode is Mode.RETURN else 0.5)
+
+    def _handle(self, alarm: Alarm) -> None:
+        """Do what an alarm asks for; the vehicle's part in the mission has ended."""
+        self._stage(alarm.reason)
+        if alarm.action is Action.RELEASE:
+            self._release()
+            return
+        if alarm.action is Action.HOLD and not self._held():
+            return
+        self.end(self.settings.watchdogs.then)
+
+    def _held(self) -> bool:
+        """Hold for the time that the settings say; whether it still does: an operator may take over meanwhile."""
+        self._stage("hold")
+        self._enter(Mode.HOLD)
+        until = time.monotonic() + self.settings.watchdogs.hold_s
+        while self.state is not State.RELEASED and time.monotonic() < until:
+            t = self.link.telemetry()
+            if t.mode is not Mode.HOLD or t.armed is False:
+                self._released(f"the operator took over with mode {t.mode_name}")
+            time.sleep(POLL_S)
+        return self.state is not State.RELEASED
+
+    def _enter(self, mode: Mode) -> None:
+        """Change the mode, unless the one that it is in is neither of ours: that is a takeover."""
+        now = self.link.telemetry()
+        ours = {Mode.FOLLOW, Mode.TAKEOFF, self._mode, mode}
+        self._mode = None  # the change that comes is ours
+        if self.state is State.FOLLOWS and self.alarm is None:
+            self.hold()  # until the mode has changed
+        if now.mode not in ours:
+            self._released(f"it is in mode {now.mode_name}, which was not ours: nothing more was asked of it")
+            return
+        try:
+            self.link.enter(mode, self.settings.answer_s)
+            self._mode = mode
+        finally:
+            self.stream.halt()
+
+    def _released(self, reason: str) -> None:
+        self._stage(reason)
+        self._raise(Alarm(Action.RELEASE, reason, takeover=True))
+        self._release()
+
+    def _release(self) -> None:
+        self.stream.halt()
+        self._mode, self.state = None, State.RELEASED
+
+    def _on_stale(self) -> None:
+        if self._mode is Mode.FOLLOW:
+            stale = self.settings.watchdogs.stale_s
+            self._raise(Alarm(Action.HOLD, f"the mission gave no setpoint for {stale:g} s: this computer is too slow"))
+
+    def _on_error(self, error: Exception) -> None:
+        self._raise(Alarm(Action.END, f"a setpoint could not be sent: {error}"))
+
+    def _raise(self, alarm: Alarm | None) -> None:
+        """Remember the first alarm: they are latched."""
+        with self._lock:
+            if self.alarm is None and alarm is not None:
+                self.alarm = alarm
+
+
+def refuse_under_way(link: VehicleLink) -> None:
+    """Raise `LinkError` if the vehicle is armed: somebody flies it, or a flight of ours was interrupted."""
+    if link.telemetry().armed:
+        raise LinkError(
+            "the vehicle is armed: somebody else flies it, or an earlier flight was interrupted. Have it disarmed (the "
+            "operator, or swarmsim fly MISSION --vehicle NAME --recover land), then start again"
+        )
+
+
+def recover(link: VehicleLink, how: str, settings: Autopilot, tell: Callable[[str], None]) -> None:
+    """Have a vehicle that is under way land or return (``how``), whoever left it there, until it is disarmed."""
+    drives = link.identity.vehicle == "rover"
+    mode = Mode.HOLD if drives and how == "land" else _MODES[how]
+    link.enter(mode, settings.answer_s)
+    tell(f"it does: {mode.value}")
+    end, slow = time.monotonic() + settings.land_s, time.monotonic()
+    while (t := link.telemetry()).armed:
+        now = time.monotonic()
+        if t.velocity_m_s is None or float(np.hypot(*t.velocity_m_s[:2])) > RESTS_M_S:
+            slow = now
+        if drives and now - slow > RESTS_S:
+            link.disarm(settings.answer_s)
+        if now > end:
+            raise LinkError(f"it is still armed after {settings.land_s:g} s (autopilot.land_s)")
+        time.sleep(POLL_S)
+    tell("it stands, disarmed")
+
+
+def _told(link: VehicleLink) -> str:
+    messages = link.messages()
+    return "it says: " + " / ".join(messages[-5:]) if messages else "it has not said why"
+
+
+__all__ = ["Control", "State", "recover", "refuse_under_way"]
