@@ -76,6 +76,8 @@ class Flight:
             raise
         finally:
             self.control.stream.close()
+            if self.control.alarm is not None:  # the first cause, not what came of it
+                self.log.ended = self.control.alarm.reason
 
     def _stop(self) -> None:
         try:
@@ -173,8 +175,7 @@ class Flight:
     def _leave_if_over(self) -> None:
         """End the vehicle's part: something was wrong, or it has ended its phases and none is to come."""
         alarm = self.control.alarm
-        if alarm is not None and not self.log.ended:
-            self.log.ended = alarm.reason
+        if alarm is not None and not self._left:
             self.live.leave()
             self._left = True
         elif self.control.state is not State.FOLLOWS and not self._wanted and not self.live.has_phase_to_come():
