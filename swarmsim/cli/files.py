@@ -21,7 +21,9 @@ from swarmsim.config.documents import read_file, shown_path
 from swarmsim.config.errors import InputError, Problem, file_errors_told, raise_if_any
 from swarmsim.config.load import load_all, load_named
 from swarmsim.config.names import one_of
+from swarmsim.config.sensors import SENSOR_KINDS
 
+_TOLD_BY_KIND = ("vehicles", "sensors")  # unions of models, which the field ``kind`` tells apart
 AUTOPILOTS = "autopilots"  # folder of what is known of real ones and their stand-ins
 
 
@@ -111,8 +113,8 @@ def kind_of_file(path: Path) -> str:
             return folder.name
     fields = read_file(path).data
     if "kind" in fields:
-        return "vehicles"
-    own = {kind: set(shape_of(model).fields((), None)) for kind, model in MODELS.items() if kind != "vehicles"}
+        return "sensors" if fields["kind"] in SENSOR_KINDS else "vehicles"
+    own = {kind: set(shape_of(MODELS[kind]).fields((), None)) for kind in files.KINDS if kind not in _TOLD_BY_KIND}
     shared = {kind: len(names & set(fields)) for kind, names in own.items()}
     best = max(shared, key=lambda kind: shared[kind])
     if shared[best] < 2 or sum(count == shared[best] for count in shared.values()) > 1:

@@ -5,6 +5,7 @@ from typing import Any
 from swarmsim.config.files import KINDS
 from swarmsim.config.mission import Mission
 from swarmsim.config.radiation import Detector, Material, Nuclide
+from swarmsim.config.sensors import Sensor
 from swarmsim.config.site import SiteSpec
 from swarmsim.config.vehicles import Vehicle
 
@@ -13,6 +14,7 @@ MODELS: dict[str, Any] = {
     "sites": SiteSpec,
     "missions": Mission,
     "detectors": Detector,
+    "sensors": Sensor,
     "nuclides": Nuclide,
     "materials": Material,
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ from swarmsim.config.errors import PROBLEMS_MAX, Problem, first_problems
 from swarmsim.config.mission import TEAM_MAX, Mission
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.phases import check_phases
+from swarmsim.config.sensors import AnySensor
 from swarmsim.config.site import SiteSpec
 from swarmsim.config.sources import POINTS_MAX, points_of
 from swarmsim.config.team import RESERVED, team_size
@@ -94,10 +95,42 @@ def check_detectors(
     return problems
 
 
+def check_sensors(
+    mission: Mission, vehicles: Sequence[Multirotor | SkidSteer], document: Document, near: Path | None
+) -> list[Problem]:
+    """Vehicle types (``vehicles``: of each entry of ``mission.vehicles``) with a sensor that does not exist."""
+    known = known_names(document.data, "sensors", near)
+    problems = []
+    types = {
+        member.type: (i, vehicle) for i, (member, vehicle) in enumerate(zip(mission.vehicles, vehicles, strict=True))
+    }
+    for name, (i, vehicle) in types.items():
+        for sensor in vehicle.sensors:
+            if sensor not in known:
+                message = f"the vehicle type '{name}' carries a sensor '{sensor}' that does not exist"
+                hint = did_you_mean(sensor, known)
+                place: Place = ("vehicles", i, "type")
+                problems.append(document.problem(place, message, allowed=one_of(known), suggestion=hint))
+    return problems
+
+
+def sensors_twice(vehicle: Multirotor | SkidSteer, sensors: Mapping[str, AnySensor]) -> list[str]:
+    """A sentence for each sensor of a vehicle that is the second of its kind."""
+    first: dict[str, str] = {}
+    told = []
+    for name in vehicle.sensors:
+        kind = sensors[name].kind
+        if kind in first:
+            told.append(f"'{vehicle.name}' carries two sensors of the kind {kind}: '{first[kind]}' and '{name}'")
+        first.setdefault(kind, name)
+    return told
+
+
 def check_consistency(scenario: Scenario) -> list[Problem]:
     """Everything that the parts of a scenario get wrong together, in the order of the mission's file."""
     checks = (
         _check_definitions,
+        _check_sensors,
         _check_timing,
         _check_materials,
         _check_names,
@@ -126,13 +159,21 @@ def _indices(value: Any) -> range:
 
 
 def _check_definitions(scenario: Scenario) -> Iterator[Problem]:
-    for kind in ("vehicles", "detectors", "nuclides", "materials"):
+    for kind in ("vehicles", "detectors", "sensors", "nuclides", "materials"):
         for key, model in getattr(scenario.mission.definitions, kind).items():
             if model.name != key:
                 place: Place = ("definitions", kind, key, "name")
                 yield scenario.problem(
                     place, "the name inside differs from the key above it", given=model.name, allowed=key
                 )
+
+
+def _check_sensors(scenario: Scenario) -> Iterator[Problem]:
+    types = {vehicle.name: (entry, vehicle) for entry, vehicle in zip(scenario.entries, scenario.vehicles, strict=True)}
+    for entry, vehicle in types.values():
+        for told in sensors_twice(vehicle, scenario.sensors):
+            suggestion = "leave one of them out: a vehicle has at most one of each kind"
+            yield scenario.problem(("vehicles", entry, "type"), told, suggestion=suggestion)
 
 
 def _check_timing(scenario: Scenario) -> Iterator[Problem]:

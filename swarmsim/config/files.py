@@ -6,7 +6,7 @@ from pathlib import Path
 from swarmsim.config.errors import InputError
 from swarmsim.config.names import did_you_mean, one_of
 
-KINDS = ("vehicles", "sites", "missions", "detectors", "nuclides", "materials")
+KINDS = ("vehicles", "sites", "missions", "detectors", "sensors", "nuclides", "materials")
 _SUFFIXES = (".yaml", ".yml")
 
 

@@ -8,6 +8,7 @@ from swarmsim.config.autopilot import Autopilot
 from swarmsim.config.base import Delay, Duration, Fraction, Gap, Length, Model, Name, Vec2
 from swarmsim.config.flight import Failsafes, FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
+from swarmsim.config.sensors import Sensor
 from swarmsim.config.sources import Source
 from swarmsim.config.vary import SOURCES_MAX, VARIED_MAX, Distribution, VariedPath
 from swarmsim.config.vehicles import Vehicle
@@ -242,7 +243,7 @@ class Phase(Model):
 
 
 class Definitions(Model):
-    """Vehicles, detectors, nuclides and materials that a scenario brings along; they come before the shipped ones.
+    """Definitions that a scenario brings along; they come before the shipped ones.
 
     With ``complete`` nothing is taken from the configuration folders, so that a resolved scenario stays what it was.
     """
@@ -250,6 +251,7 @@ class Definitions(Model):
     complete: bool = False
     vehicles: dict[Name, Vehicle] = Field(default_factory=dict)
     detectors: dict[Name, Detector] = Field(default_factory=dict)
+    sensors: dict[Name, Sensor] = Field(default_factory=dict)
     nuclides: dict[Name, Nuclide] = Field(default_factory=dict)
     materials: dict[Name, Material] = Field(default_factory=dict)
 

@@ -14,6 +14,7 @@ from swarmsim.config.checks import (
     check_consistency,
     check_detectors,
     check_references,
+    check_sensors,
     check_team_size,
     known_names,
 )
@@ -26,6 +27,7 @@ from swarmsim.config.overrides import ORIGIN, apply_overrides
 from swarmsim.config.phases import read_settings
 from swarmsim.config.policies import PolicySettings
 from swarmsim.config.radiation import Detector, Material, Nuclide
+from swarmsim.config.sensors import AnySensor
 from swarmsim.config.site import SiteSpec
 from swarmsim.config.team import chosen, expand_team, groups
 from swarmsim.config.validation import validate
@@ -45,6 +47,7 @@ class Scenario:
     vehicles: tuple[Multirotor | SkidSteer, ...]  # type of each member
     settings: tuple[PolicySettings, ...]  # of the policy of each phase
     detectors: Mapping[str, Detector]  # those that the team carries
+    sensors: Mapping[str, AnySensor]  # those that the team carries
     nuclides: Mapping[str, Nuclide]  # the whole library
     materials: Mapping[str, Material]  # the whole library
     site: SiteSpec
@@ -68,7 +71,7 @@ class Scenario:
         return self.document.problem(place, message, **details)
 
     def to_yaml(self) -> str:
-        """The scenario fully resolved: every default, setting, vehicle, detector, nuclide and material written out.
+        """The scenario fully resolved: every default, setting and definition of what it names written out.
 
         `load_scenario` reads it back to the same mission, wherever it lies: the file of a user's policy is named by its
         absolute path where the working folder does not lead to it. The site stays a name; the hashes of its files and
@@ -81,6 +84,7 @@ class Scenario:
         libraries: dict[str, Mapping[str, Any]] = {
             "vehicles": types,
             "detectors": self.detectors,
+            "sensors": self.sensors,
             "nuclides": self.nuclides,
             "materials": self.materials,
         }
@@ -137,8 +141,8 @@ def scenario_of(mission: Mission, near: Path | None = None) -> Scenario:
 def resolve(document: Document, near: Path | None, problems: list[Problem], like: "Scenario | None" = None) -> Scenario:
     """The scenario of a mission's document; ``problems`` are those found already. Raises `InputError`.
 
-    What is looked up by name (vehicles, detectors, nuclides, materials, the site) is taken from the scenario ``like``
-    where that names the same, instead of being read from its files again.
+    What is looked up by name (vehicles, detectors, sensors, nuclides, materials, the site) is taken from the scenario
+    ``like`` where that names the same, instead of being read from its files again.
     """
     add_sources(document)
     mission: Mission | None = None
@@ -178,7 +182,7 @@ def resolve(document: Document, near: Path | None, problems: list[Problem], like
 
 
 def _names_the_same(mission: Mission, other: Mission) -> bool:
-    """Whether two missions look up the same vehicles, detectors, nuclides, materials and site."""
+    """Whether two missions look up the same vehicles, detectors, sensors, nuclides, materials and site."""
     types, others = ({member.type for member in each.vehicles} for each in (mission, other))
     return mission.site == other.site and mission.definitions == other.definitions and types == others
 
@@ -220,9 +224,12 @@ def _look_up(mission: Mission, settings: tuple[PolicySettings, ...], document: D
         problems += error.problems
     raise_if_any(problems)
     assert site is not None
-    raise_if_any(check_detectors(mission, [types[entry.type] for entry in mission.vehicles], document, near))
+    entered = [types[entry.type] for entry in mission.vehicles]
+    carried_of = (check_detectors(mission, entered, document, near), check_sensors(mission, entered, document, near))
+    raise_if_any([problem for found in carried_of for problem in found])
     carried = sorted({vehicle.detector.model for vehicle in types.values() if vehicle.detector is not None})
     detectors = {name: gather("detectors", name) for name in carried}
+    sensors = {name: gather("sensors", name) for name in sorted({s for v in types.values() for s in v.sensors})}
     raise_if_any(problems)
     members, entries = expand_team(mission)
     return Scenario(
@@ -232,6 +239,7 @@ def _look_up(mission: Mission, settings: tuple[PolicySettings, ...], document: D
         vehicles=tuple(types[member.type] for member in members),
         settings=settings,
         detectors=MappingProxyType(detectors),
+        sensors=MappingProxyType(sensors),
         nuclides=MappingProxyType(nuclides),
         materials=MappingProxyType(materials),
         site=site,
@@ -257,7 +265,11 @@ def _bring_in_definitions(document: Document, overrides: Sequence[str], near: Pa
     problems: list[Problem] = []
     for text in overrides:
         steps = text.partition("=")[0].strip().split(".")
-        if steps[0] != "definitions" or len(steps) < 4 or steps[1] not in ("vehicles", "detectors", "nuclides"):
+        if (
+            steps[0] != "definitions"
+            or len(steps) < 4
+            or steps[1] not in ("vehicles", "detectors", "sensors", "nuclides")
+        ):
             continue
         place: Place = tuple(steps[:3])
         if item(item(item(document.data, place[0]), place[1]), place[2]) is not None:

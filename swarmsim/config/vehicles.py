@@ -1,7 +1,6 @@
 """Vehicles as a user writes them: every number in SI, every number with its source."""
 
-from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
@@ -24,51 +23,8 @@ from swarmsim.config.base import (
     Vec3,
 )
 from swarmsim.config.radiation import DetectorMount
-
-
-def _numeric_paths(value: Any, path: str = "") -> Iterator[str]:
-    """Dotted path of every number in nested mappings and sequences; items of a sequence are numbered from 0."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _numeric_paths(item, f"{path}.{key}" if path else str(key))
-    elif isinstance(value, list | tuple):
-        for index, item in enumerate(value):
-            yield from _numeric_paths(item, f"{path}.{index}")
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        yield path
-
-
-class Sourced(Model):
-    """A model whose every number has its source in ``sources``: dotted path to where the number is from.
-
-    A path covers its children: ``rotor`` covers ``rotor.radius_m``, ``rotors`` covers ``rotors.0.position_m.2``.
-    """
-
-    sources: dict[str, str]
-
-    @model_validator(mode="after")
-    def _every_number_has_a_source(self) -> "Sourced":
-        numbers = list(_numeric_paths(self.model_dump(exclude={"sources"})))
-        named = tuple(self.sources)
-
-        def covers(source: str, path: str) -> bool:
-            return path == source or path.startswith(f"{source}.")
-
-        missing = [path for path in numbers if not any(covers(source, path) for source in named)]
-        unused = [source for source in named if not any(covers(source, path) for path in numbers)]
-        empty = [source for source in named if not self.sources[source].strip()]
-        faults = [
-            f"{what}: {', '.join(paths[:8])}{' …' if len(paths) > 8 else ''}"
-            for what, paths in (
-                ("no source is given for", missing),
-                ("no number stands at the path of the source", unused),
-                ("the source is empty for", empty),
-            )
-            if paths
-        ]
-        if faults:
-            raise ValueError("; ".join(faults) + " (a path such as 'rotor' covers everything below it)")
-        return self
+from swarmsim.config.sensors import SensorNames
+from swarmsim.config.sourced import Sourced
 
 
 def _inertia(numbers: tuple[float, ...]) -> tuple[float, ...]:
@@ -193,6 +149,7 @@ class Multirotor(Sourced):
     ``collision_radius_m`` and ``collision_height_m`` are those of the upright cylinder around the vehicle, propellers
     and feet included. ``drag_quadratic_kg_m`` is the airframe's drag over the squared airspeed, or one such number
     along each body axis. ``inertia_kg_m2`` are three principal moments or six elements of the tensor (`Inertia`).
+    ``sensors`` are names of ``configs/sensors``, at most one of each kind; they cost nothing until they are read.
     """
 
     kind: Literal["multirotor"]
@@ -211,6 +168,7 @@ class Multirotor(Sourced):
     control: MultirotorControl
     detector: DetectorMount | None = None
     body: BodyFile | None = None
+    sensors: SensorNames = ()
 
     @model_validator(mode="after")
     def _can_fly(self) -> "Multirotor":
@@ -289,7 +247,10 @@ class SkidSteerControl(Model):
 
 
 class SkidSteer(Sourced):
-    """A rover on four wheels, skid-steered or with castors behind (``configs/vehicles/<name>.yaml``)."""
+    """A rover on four wheels, skid-steered or with castors behind (``configs/vehicles/<name>.yaml``).
+
+    ``sensors`` are names of ``configs/sensors``, at most one of each kind; they cost nothing until they are read.
+    """
 
     kind: Literal["skid_steer"]
     name: Name
@@ -307,6 +268,7 @@ class SkidSteer(Sourced):
     control: SkidSteerControl
     detector: DetectorMount | None = None
     body: BodyFile | None = None
+    sensors: SensorNames = ()
 
     @model_validator(mode="after")
     def _heavier_than_its_wheels(self) -> "SkidSteer":

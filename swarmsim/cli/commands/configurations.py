@@ -8,8 +8,8 @@ from cyclopts.validators import Number
 
 from swarmsim.cli.app import command
 
-Kind = Literal["vehicles", "sites", "missions", "detectors", "nuclides", "materials", "policies"]
-ModelKind = Literal["mission", "vehicle", "site", "detector", "nuclide", "material"]
+Kind = Literal["vehicles", "sites", "missions", "detectors", "sensors", "nuclides", "materials", "policies"]
+ModelKind = Literal["mission", "vehicle", "site", "detector", "sensor", "nuclide", "material"]
 
 
 @command
@@ -52,7 +52,7 @@ def schema(kind: ModelKind = "mission") -> None:
 
 @command(name="list")
 def list_(kind: Kind | None = None) -> None:
-    """List what is available: vehicles, sites, missions, detectors, nuclides, materials and policies.
+    """List what is available: vehicles, sites, missions, detectors, sensors, nuclides, materials and policies.
 
     For example:
         swarmsim list
