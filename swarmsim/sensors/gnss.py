@@ -87,8 +87,8 @@ def begin(gnss: Gnss, key: jax.Array) -> GnssState:
     nothing = Fix(
         position_m=jnp.zeros(3),
         velocity_m_s=jnp.zeros(3),
-        eph_m=jnp.array(jnp.inf),
-        epv_m=jnp.array(jnp.inf),
+        eph_m=jnp.float32(jnp.inf),
+        epv_m=jnp.float32(jnp.inf),
         fix=jnp.int32(NO_FIX),
     )
     depth = gnss.late // gnss.ticks + 1
@@ -118,24 +118,27 @@ def _measured(gnss: Gnss, state: GnssState, truth: Truth, key: jax.Array) -> Gns
     mean_s = jnp.where(state.poor, gnss.duration_s, gnss.between_s)
     changed = jax.random.uniform(lost) < -jnp.expm1(-gnss.interval_s / mean_s)
     poor = state.poor ^ changed
-    own = poor.astype(jnp.int32)
+
+    def own(pair: jax.Array) -> jax.Array:
+        return jnp.where(poor, pair[1], pair[0])
+
     error = gauss_markov(
         state.error,
         jax.random.normal(drift, (3,)),
         std=jnp.float32(1.0),
-        time_s=gnss.correlation_s[own],
+        time_s=own(gnss.correlation_s),
         interval_s=gnss.interval_s,
     )
-    away = gnss.baseline[own] * jnp.sqrt(jnp.sum(truth.position_m**2))
-    slow = jnp.sqrt(gnss.std_m[own] ** 2 + away**2)
-    white = gnss.noise_m[own]
+    away = own(gnss.baseline) * jnp.sqrt(jnp.sum(truth.position_m**2))
+    slow = jnp.sqrt(own(gnss.std_m) ** 2 + away**2)
+    white = own(gnss.noise_m)
     total = jnp.sqrt(slow**2 + white**2)
     fix = Fix(
         position_m=truth.position_m + slow * error + white * jax.random.normal(noise, (3,)),
-        velocity_m_s=truth.velocity_m_s + gnss.velocity_noise_m_s[own] * jax.random.normal(doppler, (3,)),
+        velocity_m_s=truth.velocity_m_s + own(gnss.velocity_noise_m_s) * jax.random.normal(doppler, (3,)),
         eph_m=jnp.hypot(total[0], total[1]),
         epv_m=total[2],
-        fix=gnss.fix[own],
+        fix=own(gnss.fix),
     )
     queue = jax.tree.map(lambda new, old: jnp.concatenate([new[None], old[:-1]]), fix, state.queue)
     return GnssState(error=error, poor=poor, queue=queue, message=state.message)
