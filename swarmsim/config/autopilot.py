@@ -7,6 +7,14 @@ from pydantic import Field, model_validator
 from swarmsim.config.base import Acceleration, Delay, Duration, Fraction, Gap, Model, Speed
 
 
+class Origin(Model):
+    """Where the origin of the mission's site lies on the Earth: WGS-84, the altitude above mean sea level."""
+
+    latitude_deg: float = Field(ge=-89, le=89)
+    longitude_deg: float = Field(ge=-180, le=180)
+    altitude_m: float = Field(ge=-500, le=9000)
+
+
 class SetpointLimits(Model):
     """What no setpoint that is sent may exceed; it is checked before any byte leaves.
 
@@ -44,8 +52,12 @@ class Autopilot(Model):
 
     ``at_end``: what it does when its part of the mission has ended in the air, and on Ctrl-C. When the operator changes
     its mode we stop commanding at once, for good.
+
+    With ``origin`` the vehicle's place in the mission is where its receiver says; without it the place where the
+    vehicle stands before the flight is taken for its start in the mission.
     """
 
+    origin: Origin | None = None
     stream_hz: float = Field(default=20.0, ge=5, le=100)
     take_off_m: float = Field(default=3.0, ge=0.5, le=100)
     at_end: Literal["land", "hold", "return"] = "land"

@@ -4,6 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from swarmsim.config.autopilot import Origin
 from swarmsim.config.base import Delay, Duration, Length, Model, Name, Speed, Vec2
 from swarmsim.config.documents import read_file
 from swarmsim.config.errors import InputError
@@ -13,14 +14,6 @@ from swarmsim.config.validation import validate
 Kind = Literal["px4", "ardupilot"]
 KINDS: tuple[Kind, ...] = ("px4", "ardupilot")
 Rate = Annotated[float, Field(gt=0, le=200)]  # Hz
-
-
-class Origin(Model):
-    """Where the origin of the mission's site lies on the Earth."""
-
-    latitude_deg: float = Field(ge=-89, le=89)
-    longitude_deg: float = Field(ge=-180, le=180)
-    altitude_m: float = Field(ge=-500, le=9000)
 
 
 class DefaultVehicle(Model):

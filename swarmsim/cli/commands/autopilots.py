@@ -112,3 +112,61 @@ def autopilot_sim(
     from swarmsim.cli.autopilot_sim import run_stand_in
 
     return run_stand_in(scenario, vehicle, autopilot, link, system, speed, seed)
+
+
+@command
+def sitl(
+    scenario: str,
+    *,
+    autopilot: Literal["px4", "ardupilot"],
+    vehicles: Annotated[int | None, Parameter(validator=Number(gte=1, lte=100), converter=whole)] = None,
+    names: Annotated[tuple[str, ...], Parameter(name="--vehicle", consume_multiple=False)] = (),
+    speed: Annotated[float, Parameter(validator=Number(gte=0, lte=100))] = 1.0,
+    duration: Annotated[float, Parameter(validator=Number(gt=0))] = float("inf"),
+    start: str | None = None,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END), converter=whole)] = None,
+    out: Path | None = None,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    force: bool = False,
+) -> int:
+    """Be the physics of real autopilot firmware: vehicles of a mission in lockstep with PX4 or ArduPilot in software.
+
+    For example:
+        swarmsim sitl recon --autopilot px4
+        swarmsim sitl recon --autopilot px4 --vehicles 3 --speed 2
+        swarmsim sitl recon --autopilot ardupilot --vehicle uav1 --vehicle orpheus
+        swarmsim sitl recon --autopilot px4 --start 'PX4_SIM_MODEL=none_iris ./px4 -d -i {instance} -w {folder} ./etc'
+
+    The physics of vehicle k is at port 4560 + k (PX4, TCP) or 9002 + 10 k (ArduPilot, UDP, --model JSON). It runs until
+    Ctrl-C. Fly the vehicles with 'swarmsim fly', or from any ground station.
+
+    Parameters
+    ----------
+    scenario
+        Name of a mission, or a mission file, with the site, the vehicles and the wind.
+    autopilot
+        Whose firmware it is.
+    vehicles
+        How many vehicles, from the first of the team; 1 by default.
+    names
+        This vehicle; may be given again and again, instead of --vehicles.
+    speed
+        Simulated seconds in a second, 0 for as fast as it goes; 1 by default.
+    duration
+        Simulated seconds after which it ends; by default it goes on until Ctrl-C.
+    start
+        Command that starts the firmware of one vehicle, with {instance}, {sysid}, {kind}, {folder}, {home} and {params}
+        for what differs; by default that of SWARMSIM_PX4_SITL or SWARMSIM_ARDUPILOT_SITL, and without one the firmware
+        is waited for.
+    seed
+        Seed of the mission, in the stead of its own.
+    out
+        Folder of the results; runs/NAME_sitl by default.
+    overrides
+        Change a value of the mission, as path=value; may be given again and again.
+    force
+        Replace an earlier session's results.
+    """
+    from swarmsim.cli.sitl import run_sitl
+
+    return run_sitl(scenario, autopilot, names, vehicles, speed, duration, start, seed, overrides, out, force)
