@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from swarmsim.config.errors import InputError
     from swarmsim.config.policies import PolicySettings
     from swarmsim.config.scenario import load_scenario as load
+    from swarmsim.config.sensors import Place
     from swarmsim.control.commands import (
         AttitudeCommand,
         BodyRateCommand,
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
     from swarmsim.runtime.run import build, run
     from swarmsim.runtime.simulation import MissionBatch, Simulation
     from swarmsim.world.model import World
+    from swarmsim.world.sensing import fit_sensors, sense, switch_on
     from swarmsim.world.state import WorldState, mission_axes
     from swarmsim.world.step import hold, reset, step
 
@@ -68,6 +70,7 @@ _HOMES = {
     "config.errors": ("InputError",),
     "config.policies": ("PolicySettings",),
     "config.scenario": ("load_scenario",),
+    "config.sensors": ("Place",),
     "control.commands": (
         "AttitudeCommand",
         "BodyRateCommand",
@@ -92,6 +95,7 @@ _HOMES = {
     "runtime.run": ("build", "run"),
     "runtime.simulation": ("MissionBatch", "Simulation"),
     "world.model": ("World",),
+    "world.sensing": ("fit_sensors", "sense", "switch_on"),
     "world.state": ("WorldState", "mission_axes"),
     "world.step": ("hold", "reset", "step"),
 }
@@ -107,6 +111,7 @@ __all__ = [
     "InputError",
     "MissionBatch",
     "MissionRecord",
+    "Place",
     "PolicySettings",
     "PositionCommand",
     "RotorSpeedCommand",
@@ -117,6 +122,7 @@ __all__ = [
     "World",
     "WorldState",
     "build",
+    "fit_sensors",
     "fly_velocity",
     "go_to",
     "hold",
@@ -130,7 +136,9 @@ __all__ = [
     "reset",
     "run",
     "sample_spectra",
+    "sense",
     "step",
+    "switch_on",
     "use_all_cores",
     "write_n42",
     "write_run",

@@ -17,6 +17,7 @@ from swarmsim.cli.run import value_text
 from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS
+from swarmsim.config.checks import sensors_twice
 from swarmsim.config.documents import read_file, shown_path
 from swarmsim.config.errors import InputError, Problem, file_errors_told, raise_if_any
 from swarmsim.config.load import load_all, load_named
@@ -72,9 +73,17 @@ def check_file(path: Path) -> tuple[str, list[str]]:
         from swarmsim.site import load_site
 
         warnings = load_site(path, tuple(load_all("materials", path))).report["warnings"]
+    elif kind == "vehicles":
+        _check_sensors(load_named(kind, path), path)
     else:
         load_named(kind, path)
     return kind.removesuffix("s"), warnings
+
+
+def _check_sensors(vehicle: Any, path: Path) -> None:
+    """Raise `InputError` where a vehicle names a sensor that there is not, or two of a kind."""
+    told = sensors_twice(vehicle, {name: load_named("sensors", name, path) for name in vehicle.sensors})
+    raise_if_any([Problem(sentence, file=shown_path(path), path="sensors") for sentence in told])
 
 
 def _check_autopilot(path: Path) -> str:

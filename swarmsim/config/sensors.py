@@ -40,8 +40,8 @@ class Place(Model):
     sea_level_pressure_pa: float = Field(default=101_325.0, ge=85_000, le=110_000)
     sea_level_temperature_k: float = Field(default=288.15, ge=200, le=340)
     declination_deg: float = Field(default=3.6, ge=-180, le=180)
-    inclination_deg: float = Field(default=63.4, ge=-90, le=90)
-    field_ut: float = Field(default=48.5, ge=1, le=100)
+    inclination_deg: float = Field(default=63.5, ge=-90, le=90)
+    field_ut: float = Field(default=48.4, ge=1, le=100)
 
 
 class Gyroscope(Model):
