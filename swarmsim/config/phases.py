@@ -89,6 +89,7 @@ def check_phases(scenario: Scenario) -> Iterator[Problem]:
     for i in range(len(scenario.mission.phases)):
         yield from _check_who(scenario, i)
         yield from _check_kinds(scenario, i)
+        yield from _check_senses(scenario, i)
         yield from _check_partners(scenario, i)
         yield from _check_landing(scenario, i)
         yield from _check_needs(scenario, i)
@@ -191,6 +192,26 @@ def _check_kinds(scenario: Scenario, i: int) -> Iterator[Problem]:
     kinds = frozenset(scenario.vehicles[k].kind for k in scenario.phase_members[i])
     for field, message in scenario.settings[i].faults(kinds):
         yield scenario.problem(("phases", i, "settings", field), message)
+
+
+def _check_senses(scenario: Scenario, i: int) -> Iterator[Problem]:
+    """Sensors that a policy reads and a vehicle of the phase lacks."""
+    from swarmsim.policies import registry
+
+    phase, told = scenario.mission.phases[i], set()
+    needed = registry.senses(phase.policy, scenario.mission_file)
+    for k in scenario.phase_members[i]:
+        vehicle, type_name = scenario.vehicles[k], scenario.members[k].type
+        carried = {scenario.sensors[name].kind for name in vehicle.sensors}
+        lacking = [kind for kind in needed if kind not in carried]
+        if lacking and type_name not in told:
+            told.add(type_name)
+            reads = f"the policy '{phase.policy}' reads {', '.join(lacking)}"
+            yield scenario.problem(
+                ("phases", i, "policy"),
+                f"{reads}, and the vehicle type '{type_name}' carries none",
+                suggestion=f"name a sensor of that kind: definitions.vehicles.{type_name}.sensors",
+            )
 
 
 def _check_partners(scenario: Scenario, i: int) -> Iterator[Problem]:

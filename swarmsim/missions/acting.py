@@ -12,14 +12,16 @@ import numpy as np
 from swarmsim import randomness
 from swarmsim.control.commands import PositionCommand, multirotor_command
 from swarmsim.missions.plan import Phase, Place, Plan
-from swarmsim.missions.state import MissionState, PhaseState
+from swarmsim.missions.state import MissionState, PhaseState, Sensing
 from swarmsim.policies.follow import FollowByAir, FollowByGround
 from swarmsim.policies.view import Belief, Task, View
 from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import Reading
+from swarmsim.sensors.suite import Readings
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, World
 from swarmsim.world.radio import Heard, heard
+from swarmsim.world.sensing import Sensed, Sensors, by_group, sense
 from swarmsim.world.state import GroupState, WorldState, now_s
 
 
@@ -56,8 +58,9 @@ def set_rows(tree: Any, indices: Sequence[int], values: Any) -> Any:
 
 
 def view_of(
-    group: Group, params: Any, battery_j: jax.Array, g: GroupState, reading: Reading | None, told: Heard | None
-) -> View:
+    group: Group, params: Any, battery_j: jax.Array, g: GroupState, reading: Reading | None, told: Heard | None,
+    sensors: Readings | None,
+) -> View:  # fmt: skip
     """What one vehicle knows, but for the time and the team's belief; arguments are its rows of the group's."""
     body, around = g.vehicle.body, g.around
     return View(
@@ -74,6 +77,7 @@ def view_of(
         reading=reading,
         heard=told,
         belief=None,
+        sensors=sensors,
     )
 
 
@@ -88,16 +92,23 @@ def heard_by(world: World, state: WorldState, number: int) -> Heard | None:
     return heard(world, state.radio, state.clock.tick, first, world.groups[number].size)
 
 
-def views(world: World, plan: Plan, state: WorldState, belief: Any) -> tuple[View, ...]:
+def views(world: World, plan: Plan, state: WorldState, belief: Any, sensing: Sensing | None) -> tuple[View, ...]:
     """What the vehicles of each group know; leading axis U on all but the time and the belief."""
     now = now_s(world, state)
     shared, made = shared_belief(plan, belief), []
     for number, (group, g) in enumerate(zip(world.groups, state.groups, strict=True)):
         reading, seen = None if g.counter is None else g.counter.reading, replace(g, counter=None)
         told = heard_by(world, state, number)
-        own = jax.vmap(partial(view_of, group))(group.params, group.limits.battery_j, seen, reading, told)
+        sensors = None if sensing is None else sensing.readings[number]
+        own = jax.vmap(partial(view_of, group))(group.params, group.limits.battery_j, seen, reading, told, sensors)
         made.append(replace(own, time_s=now, belief=shared))
     return tuple(made)
+
+
+def sensing_of(world: World, sensors: Sensors, sensed: Sensed, state: WorldState) -> Sensing:
+    """The team's navigation sensors after they were read in ``state``."""
+    sensed, readings = sense(sensors, sensed, state)
+    return Sensing(sensed=sensed, readings=by_group(sensors, world, readings))
 
 
 _SHARED = ("time_s", "belief", "settings", "site", "known")  # of a view or a task: the same for all vehicles of a group
@@ -156,7 +167,7 @@ def ask(world: World, plan: Plan, mission: MissionState) -> tuple[PhaseState, ..
     if not any(at_frames(world, policy_of(world, phase)) for phase in plan.phases):
         return mission.phases
     tick, phases = mission.world.clock.tick, []
-    seen = views(world, plan, mission.world, mission.belief)
+    seen = views(world, plan, mission.world, mission.belief, mission.sensing)
     for number, (phase, state) in enumerate(zip(plan.phases, mission.phases, strict=True)):
         policy = policy_of(world, phase)
         if at_frames(world, policy):

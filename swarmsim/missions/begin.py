@@ -16,6 +16,7 @@ from swarmsim.missions.acting import (
     phase_keys,
     policy_of,
     rows,
+    sensing_of,
     tasks,
     view_rows,
     views,
@@ -27,6 +28,7 @@ from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Situation
 from swarmsim.world import events
 from swarmsim.world.model import World
+from swarmsim.world.sensing import switch_on
 from swarmsim.world.state import now_s
 from swarmsim.world.step import reset
 
@@ -48,9 +50,12 @@ def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionStat
         windows=windows,
         survey=_no_survey(world, plan, windows, key),
         over_s=jnp.asarray(jnp.inf, jnp.float32),
+        sensing=None
+        if plan.sensors is None
+        else sensing_of(world, plan.sensors, switch_on(plan.sensors, state), state),
         trail=trail_start(world, state, plan.trail) if plan.trail else None,
     )
-    seen = views(world, plan, state, mission.belief)
+    seen = views(world, plan, state, mission.belief, mission.sensing)
     mission = replace(mission, phases=tuple(_idle(world, plan, phase, mission, seen) for phase in plan.phases))
     begin = jnp.stack([jnp.asarray((phase.start.kind == "at") & (phase.start_s <= 0.0)) for phase in plan.phases])
     active = jnp.zeros(len(world.groups), bool)

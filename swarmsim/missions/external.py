@@ -106,7 +106,7 @@ def command_of(world: World, plan: Plan, mission: MissionState, seat: Seat) -> A
     mission = replace(mission, world=seen)
     mission = replace(mission, phases=ask(world, plan, mission))
     group, state = world.groups[seat.group], mission.world.groups[seat.group]
-    view = views(world, plan, mission.world, mission.belief)[seat.group]
+    view = views(world, plan, mission.world, mission.belief, mission.sensing)[seat.group]
     given = []
     for number, phase in enumerate(plan.phases):
         place = next((p for p in phase.places if p.group == seat.group and seat.local in p.local), None)

@@ -25,6 +25,7 @@ from swarmsim.missions.acting import (
     phase_key,
     policy_of,
     rows,
+    sensing_of,
     set_rows,
     shared_belief,
     tasks,
@@ -36,6 +37,7 @@ from swarmsim.policies.view import Belief, Task, View
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
 from swarmsim.sensors.radiation import Reading
+from swarmsim.sensors.suite import Readings, stale
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world import events
 from swarmsim.world.counting import counted, not_seen, noted
@@ -102,7 +104,10 @@ def frame(world: World, plan: Plan, mission: MissionState) -> MissionState:
         for number, flown in enumerate(gone)
     ]  # fmt: skip
     clock = replace(mission.world.clock, tick=tick + world.timing.judge_ticks)
-    return replace(mission, phases=tuple(phases), world=replace(mission.world, groups=tuple(groups), clock=clock))
+    after, sensing = replace(mission.world, groups=tuple(groups), clock=clock), mission.sensing
+    if plan.sensors is not None and sensing is not None:
+        sensing = sensing_of(world, plan.sensors, sensing.sensed, after)
+    return replace(mission, phases=tuple(phases), world=after, sensing=sensing)
 
 
 def _roles(world: World, plan: Plan, group: int) -> tuple[_Role, ...]:
@@ -121,6 +126,7 @@ def _fly(
     """The vehicles of a group, each by itself."""
     group, before, timing = world.groups[number], mission.world.groups[number], world.timing
     reading = None if before.counter is None else before.counter.reading
+    sensors = None if mission.sensing is None else mission.sensing.readings[number]
     first, running = mission.world.clock.tick, mission.world.clock.running[number]
     shared = _Shared(
         first=first,
@@ -146,13 +152,13 @@ def _fly(
         return jax.lax.cond(running, flies, rests, *vehicle)  # inside, where a kernel branches at no cost
 
     every = over_vehicles(
-        one, in_axes=(0, 0, 0, 0, 0, 0, 0, 0, (TASK_AXES,) * len(roles), 0), layout=world.layout, unroll=1,
-        returned=(2, 9),
+        one, in_axes=(0, 0, 0, 0, 0, 0, 0, 0, 0, (TASK_AXES,) * len(roles), 0), layout=world.layout, unroll=1,
+        returned=(2, 10),
     )  # fmt: skip
     seen = replace(before, counter=None)  # the counter is of no concern to the motion
     flown: _Flown = every(
-        group.params, group.limits, seen, collided, reading, heard_by(world, mission.world, number), group.member,
-        mission.phase_of[number], tuple(given), tuple(parts),
+        group.params, group.limits, seen, collided, reading, heard_by(world, mission.world, number), sensors,
+        group.member, mission.phase_of[number], tuple(given), tuple(parts),
     )  # fmt: skip
     return flown
 
@@ -177,23 +183,23 @@ def _rests(group: Group, ticks: int, params: Any, limits: Limits, state: GroupSt
 def _one(
     world: World, group: Group, roles: Sequence[_Role], shared: _Shared,
     params: Any, limits: Limits, state: GroupState, collided: jax.Array, reading: Reading | None, told: Heard | None,
-    member: jax.Array, in_phase: jax.Array, given: tuple[Task, ...], parts: tuple[_Part, ...],
+    sensors: Readings | None, member: jax.Array, in_phase: jax.Array, given: tuple[Task, ...], parts: tuple[_Part, ...],
 ) -> _Flown:  # fmt: skip
     """One vehicle through the control periods of a judging period."""
     timing = world.timing
     period_s = jnp.float32(timing.control_period_s)
     state = record_events(world, group.kind, shared.now_s, params, limits, state, collided)
 
-    def view(state: GroupState, tick: jax.Array, latest: Reading | None) -> View:
+    def view(state: GroupState, tick: jax.Array, latest: Reading | None, sensors: Readings | None) -> View:
         aged = None if told is None else replace(told, age_s=told.age_s + (tick - shared.first) * period_s)
-        own = view_of(group, params, limits.battery_j, state, latest, aged)
+        own = view_of(group, params, limits.battery_j, state, latest, aged, sensors)
         return replace(own, time_s=tick * period_s, belief=shared.belief)
 
     def tick(carry: Any, _: None) -> tuple[Any, None]:
         step, state, parts, seen = carry
         at = shared.first + step
         latest = None if reading is None else replace(reading, fresh=reading.fresh & (step == 0))
-        known, commands, kept = view(state, at, latest), [], []
+        known, commands, kept = view(state, at, latest, stale(sensors, step > 0)), [], []
         for role, task, part, key in zip(roles, given, parts, shared.keys, strict=True):
             follows = in_phase == role.number
             key = jax.random.fold_in(jax.random.fold_in(key, at), member)
@@ -208,7 +214,7 @@ def _one(
     start = (jnp.int32(0), state, parts, not_seen(group, timing.judge_ticks, state.vehicle.body))
     (_, state, parts, seen), _ = jax.lax.scan(tick, start, None, length=timing.judge_ticks)
     after = shared.first + timing.judge_ticks
-    last, able = view(state, after, reading), events.able(state.event_time_s)
+    last, able = view(state, after, reading, stale(sensors, jnp.array(True))), events.able(state.event_time_s)
     active, done_s = state.active, []
     for role, task, part in zip(roles, given, parts, strict=True):
         done = _done(role, task, part, last) & able & (in_phase == role.number)

@@ -12,6 +12,7 @@ from swarmsim.policies import registry
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector
 from swarmsim.site import Site
+from swarmsim.world.sensing import Sensors
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,7 @@ class Plan:
     spectrum_radius_m: jax.Array  # [] spectra are taken within this distance of the estimate
     confidence_min: jax.Array  # [] of the identification, to replace the presumed nuclide
     phases: tuple[Phase, ...]
+    sensors: Sensors | None  # navigation sensors, for policies that sense; None if none does
     per_window: tuple[int, ...] = static()  # for each group: samples in a window of the estimate
     windows: tuple[int, ...] = static()  # for each group: windows that its vehicles can fill
     kept: tuple[int, ...] = static()  # for each group: windows of each vehicle that the estimate uses

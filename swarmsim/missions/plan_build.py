@@ -22,11 +22,17 @@ from swarmsim.site import SiteModel
 from swarmsim.world.build import detector_models, grouped
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, World
+from swarmsim.world.sensing import fit_sensors
 
 
 def listens(scenario: Scenario) -> bool:
     """Whether a policy of the mission reads what the radio brings."""
     return any(getattr(_policy(scenario, phase).object, "listens", False) for phase in scenario.mission.phases)
+
+
+def senses(scenario: Scenario) -> bool:
+    """Whether a policy of the mission reads navigation sensors."""
+    return any(registry.senses(phase.policy, scenario.mission_file) for phase in scenario.mission.phases)
 
 
 def _policy(scenario: Scenario, phase: PhaseSpec) -> PolicyReference:
@@ -59,6 +65,7 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
         spectrum_radius_m=on_host(0.0 if identification is None else identification.spectrum_radius_m),
         confidence_min=on_host(1.0 if identification is None else identification.confidence_min),
         phases=tuple(_phase(scenario, site_model, i) for i in range(len(mission.phases))),
+        sensors=fit_sensors(scenario, world, periods=world.timing.judge_ticks) if senses(scenario) else None,
         per_window=per_window,
         windows=windows,
         kept=tuple(_kept_windows(group) for group in world.groups),

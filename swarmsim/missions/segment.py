@@ -90,7 +90,7 @@ def _moving(mission: MissionState) -> MissionState:
 def _whole(mission: MissionState, moving: MissionState) -> MissionState:
     """The mission with what moves in it."""
     phases = tuple(replace(new, path=old.path) for new, old in zip(moving.phases, mission.phases, strict=True))
-    return replace(mission, phases=phases, world=moving.world)
+    return replace(mission, phases=phases, world=moving.world, sensing=moving.sensing)
 
 
 def _poses(mission: MissionState) -> tuple[Track, ...]:

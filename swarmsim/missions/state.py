@@ -10,6 +10,8 @@ from swarmsim.estimation.windows import Windows
 from swarmsim.missions.trail import Trail
 from swarmsim.policies.path import Path
 from swarmsim.pytree import pytree
+from swarmsim.sensors.suite import Readings
+from swarmsim.world.sensing import Sensed
 from swarmsim.world.state import WorldState
 
 NO_PHASE = -1
@@ -40,6 +42,14 @@ class PhaseState:
 
 
 @pytree
+class Sensing:
+    """Navigation sensors of the team, and what they read last."""
+
+    sensed: Sensed
+    readings: tuple[Readings | None, ...]  # for each group, leading axis U; None without sensors
+
+
+@pytree
 class MissionState:
     """All of one mission that changes."""
 
@@ -50,6 +60,7 @@ class MissionState:
     windows: tuple[Windows | None, ...]  # for each group: what its detectors counted
     survey: Survey | None  # of the last phase that asked for the source
     over_s: jax.Array  # [] when the mission ended; inf: it has not
+    sensing: Sensing | None  # None if no policy senses
     trail: Trail | None = None  # of the vehicles that carry sources, where spectra are drawn: truth, not known to it
 
 

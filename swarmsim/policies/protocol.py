@@ -22,6 +22,7 @@ class Policy(Protocol):
 
     ``period_s`` between two calls of `act` (each control period) · ``vehicles``: kinds of vehicle that it can steer
     (all) · ``Settings``: a `PolicySettings` class (no settings) · ``listens``: whether it reads ``view.heard`` (no) ·
+    ``senses``: kinds of navigation sensors that it reads in ``view.sensors``, such as ``("imu", "gnss")`` (none) ·
     ``done(task, memory, view) -> bool []``: whether the vehicle's part in the phase is over (never) ·
     ``task(assignment) -> pytree``: what it is to know of the scenario, made once on the host: ``task.known`` (nothing).
     """

@@ -25,6 +25,7 @@ from swarmsim.config.documents import shown_path
 from swarmsim.config.errors import InputError
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.policies import SETTINGS, PolicySettings
+from swarmsim.config.sensors import SENSOR_KINDS
 
 Policy = TypeVar("Policy")
 ENTRY_POINTS = "swarmsim.policies"
@@ -119,6 +120,26 @@ def vehicle_kinds(reference: str, near: Path | None = None) -> tuple[str, ...]:
         return model.vehicles
     kinds = getattr(find(reference, near), "vehicles", None)
     return model.vehicles if kinds is None else (kinds,) if isinstance(kinds, str) else tuple(kinds)
+
+
+def senses(reference: str, near: Path | None = None) -> tuple[str, ...]:
+    """Kinds of navigation sensors that a policy reads: its ``senses``; none of this package does.
+
+    Raises as `find` does, and where it names what is no kind of sensor.
+    """
+    if _is_shipped(reference):
+        return ()
+    given = getattr(find(reference, near), "senses", ())
+    kinds = (given,) if isinstance(given, str) else tuple(given)
+    for kind in kinds:
+        if kind not in SENSOR_KINDS:
+            raise InputError.of(
+                f"the policy '{reference}' senses '{kind}', which is no kind of sensor",
+                given=str(kind),
+                allowed=one_of(SENSOR_KINDS),
+                suggestion=did_you_mean(str(kind), SENSOR_KINDS),
+            )
+    return kinds
 
 
 def digest(reference: str, near: Path | None = None) -> str:

@@ -9,6 +9,7 @@ from swarmsim.estimation.recursive_map import Binned, read
 from swarmsim.policies.path import Path
 from swarmsim.pytree import pytree
 from swarmsim.sensors.radiation import Reading
+from swarmsim.sensors.suite import Readings
 from swarmsim.site import Site
 from swarmsim.world.radio import Heard
 
@@ -56,3 +57,4 @@ class View:
     reading: Reading | None  # of its detector (without the axis U); None without one
     heard: Heard | None  # from its team mates; None if no policy of the mission listens
     belief: Belief | None  # None where the mission maps nothing
+    sensors: Readings | None = None  # of its navigation sensors, at the last judging period; None if no policy senses

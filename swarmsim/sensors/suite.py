@@ -163,6 +163,14 @@ def read(suite: Suite, state: SuiteState, truth: Truth, key: jax.Array, tick: ja
     return after, _readings(after, fresh)
 
 
+def stale(readings: Readings | None, old: jax.Array) -> Readings | None:
+    """The readings with nothing fresh where they are ``old`` [] bool: they were seen before."""
+    if readings is None:
+        return None
+    flags = {f"{kind}_fresh": getattr(readings, f"{kind}_fresh") for kind in _MODULES}
+    return replace(readings, **{name: flag & ~old for name, flag in flags.items() if flag is not None})
+
+
 def _present(suite: Suite) -> list[tuple[str, Any]]:
     """Kinds and parameters of the sensors that there are."""
     pairs = [(field.name, getattr(suite, field.name)) for field in fields(suite)]

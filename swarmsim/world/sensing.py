@@ -11,7 +11,7 @@ what it did.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import jax
@@ -41,7 +41,6 @@ class Fitted:
     member: jax.Array  # [n] int32: number of each in the mission
     group: int = static()
     local: tuple[int, ...] = static()  # rows of the group
-    names: tuple[str, ...] = static()  # of the sensors
 
 
 @pytree
@@ -50,13 +49,13 @@ class Sensors:
 
     fitted: tuple[Fitted, ...]
     period_s: jax.Array  # [] between two calls of `sense`
+    periods: int = static()  # control periods between two calls
 
 
 @pytree
 class Sensed:
     """What sensors carry from call to call; for each of `Sensors.fitted`, leading axis n."""
 
-    tick: jax.Array  # [] int32: calls of `sense`
     states: tuple[SuiteState, ...]
     bodies: tuple[RigidState, ...]  # at the last call: accelerometers need the change of velocity
 
@@ -104,10 +103,9 @@ def fit_sensors(
                     member=on_host(members[rows], np.int32),
                     group=number,
                     local=tuple(rows),
-                    names=names,
                 )
             )
-    return Sensors(fitted=tuple(found), period_s=on_host(period))
+    return Sensors(fitted=tuple(found), period_s=on_host(period), periods=periods)
 
 
 def _with_axis(suite: Suite) -> Suite:
@@ -128,7 +126,6 @@ def _names(scenario: Scenario, others: dict[str, Sequence[str]]) -> tuple[tuple[
 def switch_on(sensors: Sensors, state: WorldState) -> Sensed:
     """All sensors switched on: their constant errors are drawn from the mission's randomness, each vehicle's own."""
     return Sensed(
-        tick=jnp.int32(0),
         states=tuple(jax.vmap(begin)(fitted.suite, _keys(fitted, state)) for fitted in sensors.fitted),
         bodies=tuple(_rows(fitted, state).vehicle.body for fitted in sensors.fitted),
     )
@@ -137,21 +134,54 @@ def switch_on(sensors: Sensors, state: WorldState) -> Sensed:
 def sense(sensors: Sensors, sensed: Sensed, state: WorldState) -> tuple[Sensed, tuple[Readings, ...]]:
     """What all sensors read now: for each of ``sensors.fitted``, leading axis n.
 
-    To be called once after the steps of every period that `fit_sensors` was told. The specific force is that of the
-    change of velocity since the last call in the attitude between both, as an IMU that sums up its samples gives it;
-    what happened within the period is averaged. Height and wind are those that the world looked up last.
+    To be called once after the steps of every period that `fit_sensors` was told: the world's clock tells which sensors
+    are due. The specific force is that of the change of velocity since the last call in the attitude between both, as
+    an IMU that sums up its samples gives it; what happened within the period is averaged. Height and wind are those
+    that the world looked up last.
     """
+    tick = state.clock.tick // sensors.periods
     states, bodies, readings = [], [], []
     for fitted, before, last in zip(sensors.fitted, sensed.states, sensed.bodies, strict=True):
         rows = _rows(fitted, state)
         truth = jax.vmap(partial(truth_of, sensors.period_s))(last, rows)
         after, reading = jax.vmap(read, in_axes=(0, 0, 0, 0, None))(
-            fitted.suite, before, truth, _keys(fitted, state), sensed.tick
+            fitted.suite, before, truth, _keys(fitted, state), tick
         )
         states.append(after)
         bodies.append(rows.vehicle.body)
         readings.append(reading)
-    return Sensed(tick=sensed.tick + 1, states=tuple(states), bodies=tuple(bodies)), tuple(readings)
+    return Sensed(states=tuple(states), bodies=tuple(bodies)), tuple(readings)
+
+
+def by_group(sensors: Sensors, world: World, readings: Sequence[Readings]) -> tuple[Readings | None, ...]:
+    """Readings of every group with leading axis U; None for a group without sensors.
+
+    What some vehicles of a group have and others lack reads zero for these, is never fresh and never valid.
+    """
+    return tuple(
+        _of_group(
+            group.size, [(f.local, r) for f, r in zip(sensors.fitted, readings, strict=True) if f.group == number]
+        )
+        for number, group in enumerate(world.groups)
+    )
+
+
+def _of_group(size: int, found: list[tuple[tuple[int, ...], Readings]]) -> Readings | None:
+    if not found:
+        return None
+    if found[0][0] == tuple(range(size)):
+        return found[0][1]
+
+    def spread(name: str) -> jax.Array | None:
+        parts = [(local, getattr(own, name)) for local, own in found if getattr(own, name) is not None]
+        if not parts:
+            return None
+        whole = jnp.zeros((size, *parts[0][1].shape[1:]), parts[0][1].dtype)
+        for local, values in parts:
+            whole = whole.at[np.asarray(local)].set(values)
+        return whole
+
+    return Readings(**{field.name: spread(field.name) for field in fields(Readings)})
 
 
 def truth_of(period_s: jax.Array, last: RigidState, now: GroupState) -> Truth:

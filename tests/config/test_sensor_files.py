@@ -24,7 +24,12 @@ CHANGES = {
     "an unknown fix": ("zed_f9p", "fix: 3d", "fix: dgps", "one of 3d, rtk_float, rtk_fixed"),
     "a range the wrong way": ("tfmini", "[0.3, 12.0]", "[12.0, 0.3]", "the first must be smaller"),
     "a pressure the wrong way": ("ms5611", "[1000.0, 120000.0]", "[1e5, 1e3]", "the first must be smaller"),
-    "a drift without its time": ("ms4525do", "drift_time_s: 300.0\n", "", "drift_std_pa and drift_time_s belong"),
+    "a drift without its time": (
+        "rm3100",
+        "soft_iron_std: 0.01\nsources:",
+        "soft_iron_std: 0.01\ndrift_std_ut: 1\nsources:\n  drift_std_ut: x",
+        "drift_std_ut and drift_time_s belong together",
+    ),
     "a number without a source": ("tfmini", "  dropout: estimate\n", "", "no source is given for: dropout"),
     "a source of nothing": (
         "tfmini",

@@ -45,6 +45,32 @@ class Climb:
         return jnp.abs(view.height_m - task.settings.height_m) < 0.3
 '''
 
+SENSING = '''
+import jax.numpy as jnp
+import swarmsim
+
+
+class Level:
+    """Climb to a height by the barometer, and remember what was read."""
+
+    senses = ("barometer", "gnss", "imu")
+
+    def start(self, task, key):
+        return {"ground_pa": jnp.zeros(()), "messages": jnp.zeros(()), "force": jnp.zeros(()), "calls": jnp.zeros(())}
+
+    def act(self, task, memory, view, key):
+        read = view.sensors
+        ground = jnp.where((memory["ground_pa"] == 0.0) & read.barometer_fresh, read.pressure_pa, memory["ground_pa"])
+        climbed = jnp.where(ground > 0.0, (ground - read.pressure_pa) / 11.5, 0.0)
+        memory = {
+            "ground_pa": ground,
+            "messages": memory["messages"] + read.gnss_fresh,
+            "force": memory["force"] + jnp.where(read.imu_fresh, read.accel_m_s2[2], 0.0),
+            "calls": memory["calls"] + read.imu_fresh,
+        }
+        return memory, swarmsim.fly_velocity(jnp.array([0.0, 0.0, 0.7]) * jnp.clip(6.0 - climbed, -1.0, 1.0))
+'''
+
 
 def written(folder, name: str, vehicles: str, phases: str):
     path = folder / f"{name}.yaml"
@@ -302,3 +328,38 @@ def test_stepping_by_hand_scans_and_batches(climbing):
     assert np.all(np.asarray(rise) - np.asarray(start) > 0.5)
     assert fresh.shape == (missions, ticks, 2)
     np.testing.assert_array_equal(np.asarray(fresh).sum(axis=1), ticks // 9)  # a sample each 0.09 s
+
+
+def test_a_policy_reads_the_sensors_that_it_says_it_senses(tmp_path):
+    """Two UAVs climb by their barometers; messages of the receiver come at its rate, each reading is fresh once."""
+    (tmp_path / "my.py").write_text(SENSING, encoding="utf-8")
+    phases = "- {name: up, who: uav, policy: 'my.py:Level', time_limit_s: 20}"
+    simulation = swarmsim.build(swarmsim.load(written(tmp_path, "sensing", UAVS, phases)))
+    assert simulation.plan.sensors is not None
+    batch = simulation.rollout(range(2))
+    memory = jax.tree.map(np.asarray, batch.end.phases[0].memory)
+    assert memory["calls"] == pytest.approx(20.0 / 0.05, abs=12)  # each judging period
+    assert memory["messages"] == pytest.approx(5 * 20.0, abs=4)
+    np.testing.assert_allclose(memory["force"] / memory["calls"], 9.81, atol=0.3)
+    assert len(set(memory["ground_pa"].ravel().tolist())) == 4  # every vehicle of every mission has its own errors
+    for vehicle in swarmsim.mission_record(simulation, batch, 0).vehicles:
+        assert vehicle.position_m[-1, 2] - vehicle.position_m[0, 2] == pytest.approx(6.0, abs=2.0)
+
+
+def test_a_mission_that_reads_no_sensor_carries_none(climbing):
+    assert climbing.plan.sensors is None
+    assert climbing.rollout([0]).end.sensing is None
+
+
+@pytest.mark.parametrize(
+    ("senses", "told"),
+    [
+        ("airspeed", "reads airspeed, and the vehicle type 'tarot_t650' carries none"),
+        ("gps", "senses 'gps', which is no kind of sensor"),
+    ],
+)
+def test_a_policy_that_senses_what_is_not_carried_is_told(tmp_path, senses, told):
+    (tmp_path / "my.py").write_text(SENSING.replace('"barometer"', f'"{senses}"'), encoding="utf-8")
+    phases = "- {name: up, who: uav, policy: 'my.py:Level', time_limit_s: 20}"
+    with pytest.raises(swarmsim.InputError, match=told):
+        swarmsim.load(written(tmp_path, "sensing", UAVS, phases))

@@ -18,10 +18,23 @@ from swarmsim.physics.rotations import from_rotation_vector, multiply, normalise
 from swarmsim.sensors.imu import Triad
 from swarmsim.sensors.suite import Readings
 from swarmsim.world.build import build_world
-from swarmsim.world.sensing import Sensors, fit_sensors, height_above, sense, switch_on
+from swarmsim.world.sensing import Fitted, Sensors, by_group, fit_sensors, height_above, sense, switch_on
 from swarmsim.world.state import WorldState
 from tests.policies.sites import block_site
-from tests.world.worlds import BUILDING, TICK_S, UAVS, Track, airborne, begin, fly, row, scenario, stay, with_group
+from tests.world.worlds import (
+    BUILDING,
+    TICK_S,
+    UAVS,
+    Track,
+    airborne,
+    at_tick,
+    begin,
+    fly,
+    row,
+    scenario,
+    stay,
+    with_group,
+)
 
 GRAVITY = 9.81
 CASE = scenario(
@@ -39,12 +52,13 @@ def world():
 
 @jax.jit
 def _along(sensors: Sensors, state: WorldState, track: Track) -> tuple[Readings, ...]:
-    def tick(sensed, body):
+    def tick(sensed, now):
+        number, body = now
         vehicle = state.groups[0].vehicle
         moved = replace(vehicle, body=replace(vehicle.body, **vars(body)))
-        return sense(sensors, sensed, with_group(state, 0, vehicle=moved))
+        return sense(sensors, sensed, at_tick(with_group(state, 0, vehicle=moved), number))
 
-    return jax.lax.scan(tick, switch_on(sensors, state), track)[1]
+    return jax.lax.scan(tick, switch_on(sensors, state), (jnp.arange(len(track.position_m)), track))[1]
 
 
 def sensed_along(sensors: Sensors, state: WorldState, track: Track) -> tuple[Readings, ...]:
@@ -52,19 +66,24 @@ def sensed_along(sensors: Sensors, state: WorldState, track: Track) -> tuple[Rea
     return jax.tree.map(np.asarray, _along(sensors, state, track))
 
 
+def kinds(fitted: Fitted) -> list[str]:
+    """Kinds of sensors that vehicles carry."""
+    return [name for name, part in vars(fitted.suite).items() if part is not None]
+
+
 def test_the_team_carries_what_its_types_name(world) -> None:
     sensors = fit_sensors(CASE, world)
-    assert [(f.group, f.local, f.names) for f in sensors.fitted] == [
-        (0, (0, 1, 2, 3, 4), ("bmi088", "ublox_m8n", "ms5611", "ist8310")),
-        (1, (0, 1), ("bmi088", "zed_f9p_rtk", "rm3100")),
+    assert [(f.group, f.local, kinds(f)) for f in sensors.fitted] == [
+        (0, (0, 1, 2, 3, 4), ["imu", "gnss", "barometer", "magnetometer"]),
+        (1, (0, 1), ["imu", "gnss", "magnetometer"]),
     ]
     assert sensors.fitted[0].suite.imu.ticks == 1
     assert sensors.fitted[0].suite.gnss.ticks == 20
     own = fit_sensors(CASE, world, others={"uav1": ("icm_20948",), "uav3": ("icm_20948",), "rover0": ()}, periods=2)
-    assert [(f.group, f.local, f.names) for f in own.fitted] == [
-        (0, (0, 2, 4), ("bmi088", "ublox_m8n", "ms5611", "ist8310")),
-        (0, (1, 3), ("icm_20948",)),
-        (1, (1,), ("bmi088", "zed_f9p_rtk", "rm3100")),
+    assert [(f.group, f.local, kinds(f)) for f in own.fitted] == [
+        (0, (0, 2, 4), ["imu", "gnss", "barometer", "magnetometer"]),
+        (0, (1, 3), ["imu"]),
+        (1, (1,), ["imu", "gnss", "magnetometer"]),
     ]
     np.testing.assert_array_equal(own.fitted[1].member, (1, 3))
     assert float(own.period_s) == pytest.approx(0.02)
@@ -223,3 +242,16 @@ def test_readings_are_those_of_the_seed_and_of_the_vehicle(world, flight) -> Non
     assert not np.array_equal(one.gyro_rad_s, other.gyro_rad_s)
     alone = fit_sensors(CASE, world, others={f"uav{k}": () for k in range(UAVS) if k != 3})
     np.testing.assert_allclose(sensed_along(alone, state, short)[0].gyro_rad_s[:, 0], one.gyro_rad_s[:, 3], rtol=1e-6)
+
+
+def test_a_group_whose_vehicles_differ_reads_zero_for_what_one_lacks(world) -> None:
+    others = {"uav0": (), "uav1": ("icm_20948",), "uav3": ("tfmini",), "rover0": (), "rover1": ()}
+    sensors = fit_sensors(CASE, world, others=others)
+    state = begin(world, jax.random.key(1))
+    air, ground = by_group(sensors, world, sense(sensors, switch_on(sensors, state), state)[1])
+    assert ground is None
+    assert air.differential_pressure_pa is None
+    assert [bool(new) for new in air.imu_fresh] == [False, True, True, False, True]
+    assert [bool(new) for new in air.rangefinder_fresh] == [False, False, False, True, False]
+    np.testing.assert_array_equal(np.asarray(air.accel_m_s2)[[0, 3]], 0.0)
+    np.testing.assert_allclose(np.asarray(air.accel_m_s2)[[1, 2, 4], 2], GRAVITY, atol=0.4)
