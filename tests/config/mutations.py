@@ -24,8 +24,8 @@ from swarmsim.config.files import packaged_dir
 from swarmsim.config.scenario import load_scenario
 from swarmsim.config.site_checks import check_site
 
-KINDS = ("missions", "vehicles", "detectors", "nuclides", "materials", "sites")
-WEIGHTS = (10, 5, 3, 1, 1, 2)
+KINDS = ("missions", "vehicles", "detectors", "sensors", "nuclides", "materials", "sites")
+WEIGHTS = (10, 5, 3, 3, 1, 1, 2)
 PATIENCE_S = 20.0  # a mutant that takes longer is stopped
 
 NUMBERS: tuple[Any, ...] = (

@@ -1,4 +1,4 @@
-"""A project folder to spoil: shipped vehicles, nuclides and materials; missions, detectors and a site of the tests."""
+"""A project folder to spoil: shipped vehicles, sensors, nuclides and materials; missions, detectors and a site of the tests."""
 
 import shutil
 from pathlib import Path
@@ -104,7 +104,7 @@ detection: paper_ideal
 def make_project(folder: Path) -> Path:
     """Fill ``folder/configs`` with the shipped things and those of the tests; the path of its recon.yaml."""
     configs = folder / "configs"
-    for kind in ("vehicles", "nuclides", "materials"):
+    for kind in ("vehicles", "sensors", "nuclides", "materials"):
         shutil.copytree(packaged_dir() / kind, configs / kind)
     (configs / "detectors").mkdir()
     for name in ("nai_2x2", "nai_1p5x1p5"):
