@@ -62,6 +62,19 @@ def yaw_of_quaternion(quaternion: ArrayLike) -> float:
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
+def quaternion_of_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float, float, float, float]:
+    """Attitude (w x y z) of yaw, then pitch (about the second axis, nose down in FLU), then roll."""
+    cr, sr = np.cos(0.5 * roll_rad), np.sin(0.5 * roll_rad)
+    cp, sp = np.cos(0.5 * pitch_rad), np.sin(0.5 * pitch_rad)
+    cy, sy = np.cos(0.5 * yaw_rad), np.sin(0.5 * yaw_rad)
+    return (
+        float(cr * cp * cy + sr * sp * sy),
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
+    )
+
+
 @dataclass(frozen=True)
 class Geodetic:
     """A place on the Earth: WGS-84, altitude in the datum of whoever gave it."""
