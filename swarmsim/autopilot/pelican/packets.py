@@ -8,7 +8,6 @@ ethz-asl/asctec_mav_framework (HL_interface.h) and ccny-ros-pkg/asctec_drivers (
 import struct
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Final
 
 START, STOP = b">*>", b"<#<"
 _HEAD = struct.Struct("<HB")  # length of the structure, its descriptor

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from swarmsim.autopilot.outer_loop import Angle, LoopSettings
+from swarmsim.autopilot.outer_loop import LoopSettings
 from swarmsim.config.base import Duration, Fraction, Gain, Length, Model, Positive, Speed
 
 Sign = Literal[-1, 1]
@@ -63,8 +63,9 @@ class PelicanSettings(Model):
     """An AscTec Pelican (or Hummingbird) with AutoPilot.
 
     ``declination_deg`` is where magnetic north lies, clockwise from true north. ``poll_every`` is how many periods lie
-    between one poll of status and satellites and the next. ``motors`` is the deflection of the yaw stick that starts and
-    stops them with the thrust at zero, ``motors_s`` how long it is held at most.
+    between one poll of status and satellites and the next. ``motors`` is the deflection of the yaw stick that starts
+    and stops them with the thrust at zero, ``motors_s`` how long it is held at most. A descent that has stood still
+    for ``landed_s`` is a landing.
     """
 
     rate_hz: float = Field(ge=5, le=50)
@@ -82,4 +83,3 @@ class PelicanSettings(Model):
     scales: Scales
     thrust: ThrustLoop
     loop: LoopSettings
-    tilt_level_deg: Angle
