@@ -93,7 +93,7 @@ class StickLink:
         self._loop, self._period_s, self._stale_s = OuterLoop(loop), 1.0 / rate_hz, stale_s
         self._lock = threading.RLock()
         self._changed = threading.Condition()
-        self._phase = Phase.RELEASED
+        self._phase, self._phase_s = Phase.RELEASED, 0.0
         self._goal: tuple[float, Setpoint] | None = None  # until when it is fresh
         self._offset: Vector | None = None  # from the vehicle's own origin to the world's
         self._telemetry = Telemetry()
@@ -192,8 +192,8 @@ class StickLink:
         try:
             self._wait_for("take off", climbed, timeout_s, self._why_not_follow)
         except LinkError:
-            if self._phase is not Phase.RELEASED:
-                self._set_phase(Phase.HOLD if self._telemetry.armed else Phase.RELEASED)
+            if not self._telemetry.armed:  # it must not take off later
+                self._set_phase(Phase.LAND)
             raise
 
     def enter(self, mode: Mode, timeout_s: float) -> None:
@@ -259,7 +259,7 @@ class StickLink:
 
     def _set_phase(self, phase: Phase) -> None:
         with self._lock:
-            self._phase, self._goal = phase, None
+            self._phase, self._goal, self._phase_s = phase, None, time.monotonic()
         self._refresh()
 
     def _release(self, reason: str) -> None:

@@ -88,12 +88,22 @@ def _check_sensors(vehicle: Any, path: Path) -> None:
 
 def _check_autopilot(path: Path) -> str:
     """Validate what is known of an autopilot, or how one is stood in for; what it is."""
+    from swarmsim.autopilot.ardrone.settings import ArdroneSettings
     from swarmsim.autopilot.mavlink.profile import Autopilot
+    from swarmsim.autopilot.pelican.settings import PelicanSettings
+    from swarmsim.autopilot.standin.ardrone import ArdroneStandinSettings
+    from swarmsim.autopilot.standin.pelican import PelicanStandinSettings
     from swarmsim.autopilot.standin.settings import Settings
     from swarmsim.config.load import load_model
 
     stand_in = path.stem.startswith("standin_")
-    load_model(path, Settings if stand_in else Autopilot)
+    special = {
+        "ardrone2": ArdroneSettings,
+        "pelican": PelicanSettings,
+        "standin_ardrone2": ArdroneStandinSettings,
+        "standin_pelican": PelicanStandinSettings,
+    }
+    load_model(path, special.get(path.stem, Settings if stand_in else Autopilot))
     return "stand-in autopilot" if stand_in else "autopilot"
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 EXIT_FLIGHT = 4  # the vehicle or the link did not do what the flight needed
 SWITCH_S = 0.0005  # Python's threads take turns this often: the stream must not wait for the mission
 ROWS = 30  # of the table of a dry run
-TLOG = "flight.tlog"
+LOG = "flight"  # with the suffix of the link's log
 
 
 def fly_mission(
@@ -50,6 +50,10 @@ def fly_mission(
         raise InputError.of(
             "the mission has no such vehicle", path="--vehicle", given=vehicle, allowed=", ".join(names)
         )
+    if not dry_run:
+        from swarmsim.autopilot.opening import parse
+
+        parse(link)  # a wrong one is told before anything is compiled
     console = Console()
     if recover is not None:
         return _recovered(link, profile, system, signing_key, recover, scenario, console)
@@ -66,10 +70,10 @@ def _recovered(
     """Have a vehicle that is under way land or return, whoever left it there."""
     from swarmsim.autopilot.control import recover
     from swarmsim.autopilot.link import LinkError
-    from swarmsim.autopilot.mavlink import MavlinkVehicle
+    from swarmsim.autopilot.opening import open_vehicle
 
     try:
-        vehicle = MavlinkVehicle(link, autopilot=profile, system=system, key_file=key)
+        vehicle = open_vehicle(link, profile=profile, system=system, key_file=key)
         try:
             recover(vehicle, how, scenario.mission.autopilot, partial(console.print, highlight=False))
         finally:
@@ -149,19 +153,19 @@ def _flown(
     from swarmsim.autopilot.flight import Flight
     from swarmsim.autopilot.guard import outline_of
     from swarmsim.autopilot.link import LinkError
-    from swarmsim.autopilot.mavlink import MavlinkVehicle
+    from swarmsim.autopilot.opening import log_suffix, open_vehicle
 
     simulation, live = _built(scenario, name)
     sys.setswitchinterval(SWITCH_S)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    log = folder.parent / f"{folder.name}.tlog"  # whatever happens, what was said stays
+    log = folder.parent / f"{folder.name}{log_suffix(link)}"  # whatever happens, what was said stays
 
     def tell(text: str) -> None:
         console.print(escape(text), highlight=False)
 
     with claimed(folder):
         try:
-            vehicle = MavlinkVehicle(link, autopilot=profile, system=system, log=log, key_file=key)
+            vehicle = open_vehicle(link, profile=profile, system=system, log=log, key_file=key)
         except LinkError as error:
             return _failed(error)
         stopped: KeyboardInterrupt | None = None
@@ -235,7 +239,7 @@ def _write(
     finally:  # what was flown stays, whatever becomes of the estimate
         folder.mkdir(parents=True, exist_ok=True)
         flown.write(folder, flight.log, summary)
-        log.replace(folder / TLOG)
+        log.replace(folder / f"{LOG}{log.suffix}")
     _print_summary(summary, console.print)
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
 

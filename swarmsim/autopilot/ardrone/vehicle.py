@@ -18,6 +18,7 @@ from swarmsim.autopilot.stick_link import FOLLOWING, FRESH_S, Phase, StickLink, 
 _READ_S = 0.05
 _AGAIN_S = 0.1  # until a command that is to be acknowledged is repeated
 _WAKE_S = 0.5
+_SURE_S = 0.5  # for so long at least it is told to stay on the ground
 _OLDER = 50  # navdata with a number so far back or less are late; farther back the drone has restarted
 _FAULTS = {
     State.MOTORS: "a motor has failed",
@@ -141,8 +142,12 @@ class ArdroneVehicle(StickLink):
         self._note("the AR.Drone has no arming: its motors start with take-off")
 
     def disarm(self, timeout_s: float) -> None:
-        """Wait until its motors stand; it has no disarming, and in the air it has to land first."""
-        self._wait_for("stop its motors (it has no disarming: land it)", lambda t: t.armed is False, timeout_s, None)
+        """Call a take-off off that has not begun; raises `LinkError` in the air, where it has to land instead."""
+        if self._telemetry.armed:
+            raise LinkError("it is in the air, and has no disarming: land it")
+        if self._phase is not Phase.RELEASED:
+            self._set_phase(Phase.LAND)
+        self._wait_for("stay on the ground", lambda _: self._phase is Phase.RELEASED, timeout_s, None)
 
     # inside
 
@@ -248,7 +253,7 @@ class ArdroneVehicle(StickLink):
             self._release("it lands, and not by our command")
         elif control is Control.LANDED and phase in (Phase.FOLLOW, Phase.HOLD):
             self._release("it has landed, and not by our command")
-        elif control is Control.LANDED and phase is Phase.LAND:
+        elif control is Control.LANDED and phase is Phase.LAND and time.monotonic() - self._phase_s > _SURE_S:
             self._phase = Phase.RELEASED
 
     def _tick(self, now_s: float, dt_s: float) -> None:

@@ -175,14 +175,14 @@ class Replies:
 def _decode(descriptor: int, payload: bytes) -> Packet | None:
     if descriptor == LL_STATUS and len(payload) == _STATUS.size:
         voltage, _, _, _, _, _, flying, motors, mode, _ = _STATUS.unpack(payload)
-        return Status(voltage * 1e-3, bool(motors or flying), FlightMode(mode & 0xFFFF))
+        return Status(voltage / 1e3, bool(motors or flying), FlightMode(mode & 0xFFFF))
     if descriptor == IMU_CALCDATA and len(payload) == _IMU.size:
         x = _IMU.unpack(payload)
-        return Imu(x[0] * 1e-3, x[1] * 1e-3, x[2] * 1e-3, x[22] * 1e-3, x[23] * 1e-3)
+        return Imu(x[0] / 1e3, x[1] / 1e3, x[2] / 1e3, x[22] / 1e3, x[23] / 1e3)
     if descriptor == GPS_DATA_ADVANCED and len(payload) == _GPS.size:
         x = _GPS.unpack(payload)
         locked = x[10] & 0x03 == 0x03
-        return Gps(x[11] * 1e-7, x[12] * 1e-7, x[13] * 1e-3, x[14] * 1e-3, x[6] * 1e-3, x[9], locked)
+        return Gps(x[11] / 1e7, x[12] / 1e7, x[13] / 1e3, x[14] / 1e3, x[6] / 1e3, x[9], locked)
     return None
 
 

@@ -4,12 +4,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from swarmsim.autopilot.settings import load_settings as settings_of
 from swarmsim.config.autopilot import Origin
 from swarmsim.config.base import Delay, Duration, Length, Model, Name, Speed, Vec2
-from swarmsim.config.documents import read_file
 from swarmsim.config.errors import InputError
-from swarmsim.config.files import config_dirs, is_file
-from swarmsim.config.validation import validate
 
 Kind = Literal["px4", "ardupilot"]
 KINDS: tuple[Kind, ...] = ("px4", "ardupilot")
@@ -58,9 +56,5 @@ def load_settings(kind: str) -> Settings:
     """Settings of ``px4`` or ``ardupilot``, from the working folder's ``configs`` or the shipped ones."""
     if kind not in KINDS:
         raise InputError.of(f"there is no autopilot '{kind}'", given=kind, allowed=" or ".join(KINDS))
-    for folder in config_dirs():
-        file = folder / "autopilots" / f"standin_{kind}.yaml"
-        if is_file(file):
-            settings: Settings = validate(read_file(file), Settings)
-            return settings
-    raise InputError.of(f"the settings of the stand-in are missing: autopilots/standin_{kind}.yaml")
+    settings: Settings = settings_of(f"standin_{kind}", Settings)
+    return settings

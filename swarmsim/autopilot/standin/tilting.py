@@ -109,6 +109,7 @@ class StickStandin:
         self.lateness_s = 0.0
         self.log: list[str] = []
         """What has happened, in sentences."""
+        self._error: Exception | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
 
@@ -156,8 +157,17 @@ class StickStandin:
     ) -> None:
         self._stop.set()
         self._thread.join(5.0)
+        if self._error is not None and error is None:
+            raise self._error
 
     def _run(self) -> None:
+        try:
+            self._paced()
+        except Exception as error:  # told by __exit__, in the thread that waits for the end
+            self._error = error
+            self._stop.set()
+
+    def _paced(self) -> None:
         due = time.monotonic()
         period = self.body.step_s / self.speed
         while not self._stop.wait(max(0.0, due - time.monotonic())):

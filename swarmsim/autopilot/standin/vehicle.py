@@ -71,6 +71,11 @@ class Standin:
         return self.pilot.faults
 
     @property
+    def log(self) -> list[str]:
+        """What has happened, in sentences."""
+        return self.pilot.log
+
+    @property
     def mode(self) -> str:
         """Name of the mode."""
         return self.pilot.mode

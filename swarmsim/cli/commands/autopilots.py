@@ -15,7 +15,7 @@ def fly(
     *,
     vehicle: str,
     link: str = "udpin:127.0.0.1:14540",
-    profile: Literal["px4", "ardupilot", "auto"] = "auto",
+    profile: Literal["px4", "ardupilot", "ardrone2", "pelican", "auto"] = "auto",
     system: Annotated[int | None, Parameter(validator=Number(gte=1, lte=255), converter=whole)] = None,
     seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END), converter=whole)] = None,
     out: Path | None = None,
@@ -25,12 +25,14 @@ def fly(
     dry_run: bool = False,
     force: bool = False,
 ) -> int:
-    """Fly one vehicle of a mission on a real autopilot, PX4 or ArduPilot; the others are simulated around it.
+    """Fly one vehicle of a mission on a real autopilot; the others are simulated around it.
 
     For example:
         swarmsim fly recon --vehicle uav1 --dry-run
         swarmsim fly recon --vehicle uav1 --link udpin:127.0.0.1:14540
         swarmsim fly recon --vehicle uav1 --link serial:/dev/ttyUSB0:57600 --profile ardupilot
+        swarmsim fly recon --vehicle uav1 --link ardrone:192.168.1.1
+        swarmsim fly recon --vehicle uav1 --link pelican:/dev/ttyUSB0
         swarmsim fly recon --vehicle uav1 --recover land
 
     How it flies (limits, watchdogs, what it does at the end) stands under 'autopilot' in the mission. Ctrl-C ends the
@@ -44,7 +46,8 @@ def fly(
         Name of the vehicle in the mission.
     link
         Where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or
-        serial:DEVICE:BAUD.
+        serial:DEVICE:BAUD for PX4 and ArduPilot, ardrone:HOST for an AR.Drone 2.0, pelican:DEVICE for an AscTec
+        Pelican.
     profile
         Which autopilot it is; auto (the default) takes what it says of itself.
     system
@@ -76,18 +79,20 @@ def autopilot_sim(
     scenario: str | None = None,
     *,
     vehicle: str | None = None,
-    autopilot: Literal["px4", "ardupilot"] = "px4",
+    autopilot: Literal["px4", "ardupilot", "ardrone2", "pelican"] = "px4",
     link: str | None = None,
     system: Annotated[int, Parameter(name="--sysid", validator=Number(gte=1, lte=255), converter=whole)] = 1,
     speed: Annotated[float, Parameter(validator=Number(gte=0.1, lte=100))] = 1.0,
     seed: Annotated[int, Parameter(validator=Number(gte=0, lt=SEED_END), converter=whole)] = 0,
 ) -> int:
-    """Stand in for a real autopilot: a MAVLink vehicle that behaves as PX4 or ArduPilot do, over swarmsim's physics.
+    """Stand in for a real autopilot: a vehicle that behaves as one with it does, over swarmsim's physics.
 
     For example:
         swarmsim autopilot-sim
         swarmsim autopilot-sim recon --vehicle uav1 --autopilot px4 --link udpout:127.0.0.1:14540
         swarmsim autopilot-sim recon --vehicle orpheus --autopilot ardupilot --link tcpin:127.0.0.1:5760
+        swarmsim autopilot-sim --autopilot ardrone2 --link ardrone:127.0.0.1
+        swarmsim autopilot-sim --autopilot pelican
 
     It runs until Ctrl-C. Fly it with 'swarmsim fly', or from any ground station.
 
@@ -101,9 +106,10 @@ def autopilot_sim(
         Whose behaviour it has; px4 by default.
     link
         Where it offers its link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT; by default that of the
-        autopilot's own simulation.
+        autopilot's own simulation. An ardrone2 listens at ardrone:HOST[:COMMANDS:NAVDATA], a pelican at a
+        pseudo-terminal that it names.
     system
-        Its system id; 1 by default.
+        Its MAVLink system id; 1 by default.
     speed
         Simulated seconds in a second; 1 by default.
     seed
