@@ -287,6 +287,15 @@ class StickLink:
             for listener in list(self._listeners):
                 listener(after)
 
+    def _wait_ready(self, timeout_s: float, why_not: Callable[[], str | None]) -> None:
+        """Wait until it is ready by data that come from now on."""
+        begin = time.monotonic()
+
+        def ready(t: Telemetry) -> bool:
+            return bool(t.ready_to_arm) and min(t.heard_s or 0.0, t.pose_s or 0.0) >= begin
+
+        self._wait_for("get ready", ready, timeout_s, why_not)
+
     def _wait_for(
         self,
         what: str,

@@ -109,7 +109,7 @@ class ArdroneVehicle(StickLink):
             f"its nose has to point {s.start_heading_deg:g} deg counter-clockwise from east: it knows no north, and "
             "its position is dead reckoning"
         )
-        self._wait_for("get ready", lambda t: bool(t.ready_to_arm), max(0.1, end - time.monotonic()), self._not_ready)
+        self._wait_ready(max(0.2, end - time.monotonic()), self._not_ready)
         self._transmit(("FTRIM",), moves=True)
 
     def _configure(self, key: str, value: str) -> None:
@@ -273,7 +273,7 @@ class ArdroneVehicle(StickLink):
             self._transmit(*keep, ("REF", at.REF_BASE | at.REF_START), moves=True)
         elif phase in (Phase.TAKE_OFF, Phase.FOLLOW, Phase.HOLD):
             self._transmit(*keep, self._progress(now_s, dt_s), moves=True)
-        elif not airborne:
+        elif not self._telemetry.armed:  # on the ground the watchdog is kept quiet; in the air somebody else flies it
             self._transmit(("COMWDG",))
 
     def _progress(self, now_s: float, dt_s: float) -> tuple[at.Argument, ...]:

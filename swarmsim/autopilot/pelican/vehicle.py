@@ -77,7 +77,7 @@ class PelicanVehicle(StickLink):
 
     def preflight(self, tell: Callable[[str], None], timeout_s: float) -> None:
         """Wait until its motors can be started; raises `LinkError` with every reason when the time is up."""
-        self._wait_for("get ready", lambda t: bool(t.ready_to_arm), timeout_s, self._not_ready)
+        self._wait_ready(timeout_s, self._not_ready)
         status, gps = self._status, self._gps
         assert status is not None
         assert gps is not None
