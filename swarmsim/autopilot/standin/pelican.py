@@ -18,8 +18,8 @@ from swarmsim.autopilot.pelican import packets
 from swarmsim.autopilot.pelican.packets import STICK_MAX, THRUST_MAX, Control, FlightMode, Gps, Imu, Status
 from swarmsim.autopilot.pelican.settings import Battery
 from swarmsim.autopilot.standin.body import Body, Motion, Sensed
-from swarmsim.autopilot.standin.settings import Origin
 from swarmsim.autopilot.standin.tilting import Sticks, StickSettings, StickStandin
+from swarmsim.config.autopilot import Origin
 from swarmsim.config.base import Duration, Fraction, Length, NonNegative, Positive, Speed
 from swarmsim.config.errors import InputError
 
