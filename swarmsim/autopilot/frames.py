@@ -42,15 +42,14 @@ yaw_enu_of_ned = yaw_ned_of_enu
 
 
 def quaternion_ned_of_enu(quaternion: ArrayLike) -> Array:
-    """Attitude [4] (w x y z) of FRD in NED from that of FLU in ENU; the same function leads back.
+    """Attitudes [..., 4] (w x y z) of FRD in NED from those of FLU in ENU; the same function leads back.
 
     With s = sqrt(1/2) the rotation from ENU to NED is (0, s, s, 0), and that from FRD to FLU is (0, 1, 0, 0): their
     product with the attitude between them, of which the sign with a positive w is taken.
     """
-    w, x, y, z = np.asarray(quaternion, np.float64)
-    s = np.sqrt(0.5)
-    turned = s * np.array([w + z, x + y, x - y, w - z])
-    return turned if turned[0] >= 0.0 else -turned
+    w, x, y, z = np.moveaxis(np.asarray(quaternion, np.float64), -1, 0)
+    turned: Array = np.sqrt(0.5) * np.stack([w + z, x + y, x - y, w - z], axis=-1)
+    return np.where(turned[..., :1] >= 0.0, turned, -turned)
 
 
 quaternion_enu_of_ned = quaternion_ned_of_enu
@@ -84,12 +83,18 @@ class Geodetic:
     altitude_m: float
 
 
-def _ecef(place: Geodetic) -> Array:
-    latitude, longitude = np.radians([place.latitude_deg, place.longitude_deg])
+def _ecef(places: ArrayLike) -> Array:
+    """Metres [..., 3] of places [..., 3]: latitude and longitude in degrees, altitude in m."""
+    latitude, longitude, altitude = np.moveaxis(np.asarray(places, np.float64), -1, 0)
+    latitude, longitude = np.radians(latitude), np.radians(longitude)
     n = EARTH_RADIUS_M / np.sqrt(1.0 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
-    out = (n + place.altitude_m) * np.cos(latitude)
-    up = (n * (1.0 - _ECCENTRICITY2) + place.altitude_m) * np.sin(latitude)
-    return np.array([out * np.cos(longitude), out * np.sin(longitude), up])
+    out = (n + altitude) * np.cos(latitude)
+    up = (n * (1.0 - _ECCENTRICITY2) + altitude) * np.sin(latitude)
+    return np.stack([out * np.cos(longitude), out * np.sin(longitude), up], axis=-1)
+
+
+def _place(place: Geodetic) -> Array:
+    return _ecef([place.latitude_deg, place.longitude_deg, place.altitude_m])
 
 
 def _axes(origin: Geodetic) -> Array:
@@ -101,7 +106,22 @@ def _axes(origin: Geodetic) -> Array:
 
 def enu_of_geodetic(place: Geodetic, origin: Geodetic) -> Array:
     """Metres [3] east, north and up of the origin, on the tangent plane there."""
-    offset: Array = _axes(origin) @ (_ecef(place) - _ecef(origin))
+    return enu_of_places([place.latitude_deg, place.longitude_deg, place.altitude_m], origin)
+
+
+def enu_of_places(places: ArrayLike, origin: Geodetic) -> Array:
+    """Metres [..., 3] of places [..., 3] east, north and up of the origin, on the tangent plane there.
+
+    A place is latitude and longitude in degrees, and altitude in m.
+    """
+    offset: Array = (_ecef(places) - _place(origin)) @ _axes(origin).T
+    return offset
+
+
+def moved_origin(offset_m: ArrayLike, origin: Geodetic, new: Geodetic) -> Array:
+    """Metres [..., 3] east, north and up of ``new``, on the tangent plane there, from those of ``origin``."""
+    earth = np.asarray(offset_m, np.float64) @ _axes(origin) + _place(origin)
+    offset: Array = (earth - _place(new)) @ _axes(new).T
     return offset
 
 
@@ -110,7 +130,7 @@ def geodetic_of_enu(offset_m: ArrayLike, origin: Geodetic) -> Geodetic:
 
     From ECEF by Bowring's iteration (Survey Review 28, 1985, 202), which two rounds bring below a micrometre here.
     """
-    x, y, z = _ecef(origin) + _axes(origin).T @ np.asarray(offset_m, np.float64)
+    x, y, z = _place(origin) + _axes(origin).T @ np.asarray(offset_m, np.float64)
     out = np.hypot(x, y)
     latitude = np.arctan2(z, out * (1.0 - _ECCENTRICITY2))
     for _ in range(4):

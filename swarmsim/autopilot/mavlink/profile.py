@@ -116,6 +116,8 @@ class Autopilot(Model):
     """A message that was asked for and has not come for this long is asked for again."""
     advice: dict[str, Text] = Field(default_factory=dict)
     """What to do where a command is refused, by what was wanted: follow, arm, take off, hold, land, return."""
+    nav_states: dict[Byte, Name] = Field(default_factory=dict)
+    """Names of the modes by vehicle_status.nav_state, as logs of PX4 have it."""
     copter: VehicleProfile
     rover: VehicleProfile
 
