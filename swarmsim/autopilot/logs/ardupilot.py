@@ -58,7 +58,7 @@ def _system(messages: dict[str, Messages]) -> int | None:
         return None
     parameters = messages["PARM"]
     values = dict(zip(parameters.texts("Name"), parameters.numbers("Value"), strict=True))
-    return next((int(values[name]) for name in _SYSTEM if name in values), None)
+    return next((int(values[name]) for name in _SYSTEM if 1.0 <= values.get(name, 0.0) <= 255.0), None)
 
 
 def _origin(messages: dict[str, Messages]) -> Geodetic | None:

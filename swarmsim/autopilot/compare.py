@@ -1,0 +1,302 @@
+"""How far a flown track lies from the planned paths, and from the simulated track of the same mission.
+
+Two kinds of error are told apart, and neither stands for the other:
+
+- *Geometric*: the least horizontal distance of each place that was flown from a line, whenever it was flown: from the
+  planned path of its phase (cross-track error), and from the simulated track. A vehicle that is merely late has none.
+- *Time-synchronised*: the horizontal distance between the flown and the simulated vehicle at the same time, after one
+  constant shift of time, the one with the least rms. It holds lags along the track, and whatever differs in take-off,
+  corners and speed after that one shift. A flight's clock and a mission's have no common zero, so that without a shift
+  the number would mean nothing.
+
+"Simulated against firmware in the loop, same mission" is the time-synchronised rms over the whole common time, nothing
+left out. "On the lines" leaves out corners, take-off and landing: samples where the horizontal speed (simulated, or
+flown where nothing was simulated) is below 0.7 of its greatest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize_scalar
+
+Floats = NDArray[np.float64]
+ON_LINE_SHARE = 0.7  # of the greatest speed: slower parts are corners, take-off and landing
+STEP_S = 0.05  # of the times at which tracks are compared
+GAP_S = 1.0  # between two positions farther apart in time nothing is assumed
+OVERLAP = 0.8  # of the shorter track must be compared, or a shift is none
+CORNER_M = 0.5  # a path that bends by less is one leg
+LEG_M = 2.0  # shorter ones are corners
+_COARSE_S, _COARSE_MAX = 0.25, 2000  # step of the first search for the shift, and its greatest number of samples
+_SPEED_OVER_S = 1.0
+_CHUNK = 256
+
+
+@dataclass(frozen=True)
+class Track:
+    """Positions [n, 3] in the world (ENU) at increasing times [n]."""
+
+    time_s: Floats
+    position_m: Floats
+
+    def at(self, time_s: ArrayLike) -> Floats:
+        """Positions [m, 3] at ``time_s`` [m], linear in between; NaN outside, and in gaps longer than 1 s."""
+        times = np.asarray(time_s, np.float64)
+        if not len(self.time_s):
+            return np.full((len(times), 3), np.nan)
+        columns = [np.interp(times, self.time_s, column, np.nan, np.nan) for column in self.position_m.T]
+        after = np.clip(np.searchsorted(self.time_s, times), 1, max(1, len(self.time_s) - 1))
+        gap = self.time_s[np.minimum(after, len(self.time_s) - 1)] - self.time_s[after - 1] > GAP_S
+        return np.where(gap[:, None], np.nan, np.stack(columns, axis=1))
+
+    def speed_m_s(self, time_s: Floats) -> Floats:
+        """Horizontal speeds [m], over 1 s around each time or what there is of it."""
+        half = 0.5 * _SPEED_OVER_S
+        low, high = self.time_s[[0, -1]]
+        a, b = np.clip(time_s - half, low, high), np.clip(time_s + half, low, high)
+        way = np.linalg.norm((self.at(b) - self.at(a))[:, :2], axis=1)
+        return way / np.maximum(b - a, 1e-9)
+
+    def within(self, spans_s: Sequence[tuple[float, float]]) -> "Track":
+        """What lies in one of the spans."""
+        keep = np.zeros(len(self.time_s), bool)
+        for a, b in spans_s:
+            keep |= (self.time_s >= a) & (self.time_s <= b)
+        return Track(self.time_s[keep], self.position_m[keep])
+
+
+@dataclass(frozen=True)
+class Planned:
+    """The path [P, 3] that a phase plans for the vehicle."""
+
+    phase: str
+    points_m: Floats
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """The track of the mission's own simulated vehicle."""
+
+    track: Track
+    phase: NDArray[np.int64]  # [n] index into the planned paths, -1 where there is none
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Errors at times [k] of the flown track's clock; NaN where there is nothing to compare with."""
+
+    time_s: Floats
+    shift_s: float | None  # to be added to the simulated track's times; None: nothing simulated, or no common part
+    cross_track_m: Floats  # horizontal distance from the planned path
+    above_path_m: Floats  # height over the planned path there
+    synchronised_m: Floats  # horizontal distance from the simulated vehicle at the same time
+    above_m: Floats  # height over it
+    from_simulated_m: Floats  # horizontal distance from its track
+    on_lines: NDArray[np.bool_]
+    phase: NDArray[np.int64]  # index into ``phases``, -1 where it is not known
+    leg: NDArray[np.int64]  # number of the straight part of the path that is nearest, -1 where none is
+    phases: tuple[str, ...]
+
+    def measures(self) -> dict[str, Floats]:
+        """The errors by the names that reports have."""
+        return {
+            "cross_track": self.cross_track_m,
+            "above_path": self.above_path_m,
+            "synchronised": self.synchronised_m,
+            "above_simulated": self.above_m,
+            "from_simulated_track": self.from_simulated_m,
+        }
+
+    def report(self) -> dict[str, Any]:
+        """Sums for a file: m and s; over the common time, on the lines alone, by phase, and by leg on the lines."""
+        everywhere = np.ones(len(self.time_s), bool)
+        return {
+            "time_shift_s": self.shift_s,
+            "from_s": float(self.time_s[0]) if len(self.time_s) else None,
+            "to_s": float(self.time_s[-1]) if len(self.time_s) else None,
+            "whole": self._of(everywhere),
+            "on_lines": self._of(self.on_lines),
+            "phases": [{"phase": name} | self._of(self.phase == k) for k, name in enumerate(self.phases)],
+            "legs": [
+                {"phase": self.phases[k], "leg": int(leg) + 1} | {"cross_track": statistics(self.cross_track_m[mask])}
+                for k in range(len(self.phases))
+                for leg in np.unique(self.leg[(self.phase == k) & (self.leg >= 0)])
+                if (mask := (self.phase == k) & (self.leg == leg) & self.on_lines).any()
+            ],
+        }
+
+    def _of(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        return {name: statistics(error[mask]) for name, error in self.measures().items()}
+
+
+def statistics(error_m: Floats) -> dict[str, Any] | None:
+    """Number, rms, 95th percentile and greatest of the magnitudes; None where there is none."""
+    size = np.abs(error_m[np.isfinite(error_m)])
+    if not len(size):
+        return None
+    return {
+        "samples": len(size),
+        "rms_m": float(np.sqrt(np.mean(size**2))),
+        "p95_m": float(np.percentile(size, 95.0)),
+        "max_m": float(np.max(size)),
+    }
+
+
+def compare(
+    flown: Track, planned: Sequence[Planned] = (), simulated: Simulated | None = None,
+    spans_s: Sequence[tuple[float, float]] | None = None,
+) -> Comparison:  # fmt: skip
+    """The errors of a flown track, of which ``spans_s`` alone are judged if given."""
+    judged = flown if spans_s is None else flown.within(spans_s)
+    shift = None if simulated is None else time_shift_s(judged, simulated.track)
+    time_s = _times(judged, simulated, shift)
+    place = judged.at(time_s)
+    known = np.isfinite(place).all(axis=1)
+    time_s, place = time_s[known], place[known]
+    nothing = np.full(len(time_s), np.nan)
+    synchronised, above, apart, phase = nothing, nothing, nothing, np.full(len(time_s), -1)
+    leader, own = judged, time_s
+    if simulated is not None and shift is not None:
+        leader, own = simulated.track, time_s - shift
+        there = leader.at(own)
+        synchronised = np.linalg.norm((place - there)[:, :2], axis=1)
+        above = place[:, 2] - there[:, 2]
+        apart = nearest(place[:, :2], leader.position_m)[0] if len(place) else nothing
+        phase = simulated.phase[np.clip(np.searchsorted(leader.time_s, own), 0, len(leader.time_s) - 1)]
+    elif len(planned) == 1:
+        phase = np.zeros(len(time_s), int)
+    distance, height, leg = _from_paths(place, planned, phase)
+    return Comparison(
+        time_s=time_s,
+        shift_s=shift,
+        cross_track_m=distance,
+        above_path_m=place[:, 2] - height,
+        synchronised_m=synchronised,
+        above_m=above,
+        from_simulated_m=apart,
+        on_lines=on_lines(leader.speed_m_s(own)) if len(time_s) else np.zeros(0, bool),
+        phase=np.asarray(phase),
+        leg=leg,
+        phases=tuple(path.phase for path in planned),
+    )
+
+
+def _times(flown: Track, simulated: Simulated | None, shift: float | None) -> Floats:
+    """Evenly spaced times of the common part."""
+    if not len(flown.time_s):
+        return np.zeros(0)
+    low, high = float(flown.time_s[0]), float(flown.time_s[-1])
+    if simulated is not None and shift is not None:
+        low = max(low, float(simulated.track.time_s[0]) + shift)
+        high = min(high, float(simulated.track.time_s[-1]) + shift)
+    return np.asarray(low + STEP_S * np.arange(max(0, int((high - low) / STEP_S + 1e-6)) + 1), np.float64)
+
+
+def on_lines(speed_m_s: Floats) -> NDArray[np.bool_]:
+    """Where a speed [n] is nearly the greatest."""
+    known = np.isfinite(speed_m_s)
+    top = float(np.max(speed_m_s[known])) if known.any() else 0.0
+    return np.asarray(known & (speed_m_s > ON_LINE_SHARE * top))
+
+
+def nearest(places_m: ArrayLike, path_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
+    """Of places [n, 2] the horizontal distance [n] from a polyline [P, 3], and its height and arc length there [n]."""
+    places, path = np.asarray(places_m, np.float64), np.asarray(path_m, np.float64)
+    if len(path) == 1:
+        path = np.concatenate([path, path])
+    start, step = path[:-1], np.diff(path, axis=0)
+    length2 = np.sum(step[:, :2] ** 2, axis=1)
+    along = np.r_[0.0, np.cumsum(np.sqrt(length2))]
+    distance, height, arc = (np.full(len(places), np.nan) for _ in range(3))
+    for first in range(0, len(places), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        offset = places[part, None] - start[:, :2]
+        share = np.clip(np.sum(offset * step[:, :2], axis=2) / np.maximum(length2, 1e-12), 0.0, 1.0)
+        apart = np.sum((offset - share[..., None] * step[:, :2]) ** 2, axis=2)
+        best = np.argmin(apart, axis=1)
+        row = np.arange(len(best))
+        distance[part] = np.sqrt(apart[row, best])
+        height[part] = start[best, 2] + share[row, best] * step[best, 2]
+        arc[part] = along[best] + share[row, best] * (along[best + 1] - along[best])
+    return distance, height, arc
+
+
+def _from_paths(
+    place_m: Floats, planned: Sequence[Planned], phase: NDArray[np.int64]
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Distance from the path of the phase, or from the nearest path where that is not known, height and leg there."""
+    distance = np.full(len(place_m), np.inf)
+    height, leg = np.full(len(place_m), np.nan), np.full(len(place_m), -1)
+    for k, path in enumerate(planned):
+        mine = np.flatnonzero((phase == k) | (phase < 0))
+        if not len(path.points_m) or not len(mine):
+            continue
+        apart, up, along = nearest(place_m[mine, :2], path.points_m)
+        closer = apart < distance[mine]
+        rows = mine[closer]
+        distance[rows], height[rows] = apart[closer], up[closer]
+        leg[rows] = np.searchsorted(leg_ends_m(path.points_m), along[closer], "left")
+    return np.where(np.isfinite(distance), distance, np.nan), height, leg
+
+
+def leg_ends_m(path_m: Floats) -> Floats:
+    """Arc lengths at which the straight parts of a path [P, 3] end, but the last (Douglas-Peucker, 0.5 m)."""
+    plane = np.asarray(path_m, np.float64)[:, :2]
+    along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(plane, axis=0), axis=1))]
+    corners, open_ = {0, len(plane) - 1}, [(0, len(plane) - 1)]
+    while open_:
+        a, b = open_.pop()
+        if b - a < 2:
+            continue
+        apart = nearest(plane[a + 1 : b], np.c_[plane[[a, b]], [0.0, 0.0]])[0]
+        worst = int(np.argmax(apart))
+        if apart[worst] > CORNER_M:
+            corners.add(a + 1 + worst)
+            open_ += [(a, a + 1 + worst), (a + 1 + worst, b)]
+    ends = along[sorted(corners)][1:]
+    kept: list[float] = []
+    for end in ends[:-1]:
+        if end - (kept[-1] if kept else 0.0) >= LEG_M:
+            kept.append(float(end))
+    return np.array(kept)
+
+
+def time_shift_s(flown: Track, simulated: Track) -> float | None:
+    """What to add to the simulated times so that the horizontal distance of both at the same time has the least rms.
+
+    None where no shift brings 0.8 of the shorter track over the other.
+    """
+    if len(flown.time_s) < 2 or len(simulated.time_s) < 2:
+        return None
+    spans = [float(track.time_s[-1] - track.time_s[0]) for track in (flown, simulated)]
+    needed = OVERLAP * min(spans)
+
+    def rms(shift: float, times: Floats, there: Floats) -> float:
+        error = (flown.at(times + shift) - there)[:, :2]
+        known = np.isfinite(error).all(axis=1)
+        if known.sum() * (times[1] - times[0]) < needed:
+            return np.inf
+        return float(np.sqrt(np.mean(np.sum(error[known] ** 2, axis=1))))
+
+    step = max(_COARSE_S, max(spans) / _COARSE_MAX)
+    times, there = _grid(simulated, min(step, spans[1] / 8.0))
+    first = float(flown.time_s[0] - simulated.time_s[-1])
+    shifts = first + step * np.arange(int(sum(spans) / step) + 2)
+    found = np.array([rms(float(shift), times, there) for shift in shifts])
+    if not np.isfinite(found).any():
+        return None
+    best = float(shifts[int(np.argmin(found))])
+    times, there = _grid(simulated, min(max(STEP_S, spans[1] / 20_000), spans[1] / 8.0))
+    near = minimize_scalar(
+        lambda shift: min(rms(float(shift), times, there), 1e9), bounds=(best - step, best + step), method="bounded",
+        options={"xatol": 1e-4},
+    )  # fmt: skip
+    return float(near.x) if near.fun <= rms(best, times, there) else best
+
+
+def _grid(track: Track, step_s: float) -> tuple[Floats, Floats]:
+    times = np.arange(float(track.time_s[0]), float(track.time_s[-1]) + 0.5 * step_s, step_s)
+    return times, track.at(np.minimum(times, track.time_s[-1]))
