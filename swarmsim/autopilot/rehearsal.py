@@ -1,6 +1,6 @@
 """A rehearsal: the setpoints that a flight would send, from the mission with its own simulated vehicle."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,8 @@ from swarmsim.autopilot.convert import setpoint_of
 from swarmsim.autopilot.frames import ned_of_enu, yaw_ned_of_enu
 from swarmsim.autopilot.guard import Guard, RefusedError
 from swarmsim.autopilot.link import Setpoint
-from swarmsim.runtime.live import LiveMission
+from swarmsim.runtime.live import LiveMission, LiveStep
+from swarmsim.vehicles.state import RigidState
 
 
 @dataclass(frozen=True)
@@ -22,14 +23,21 @@ class Sent:
     refused: str = ""  # why it would not be sent
 
 
-def rehearse(live: LiveMission, guard: Guard, limit_s: float) -> list[Sent]:
+def rehearse(
+    live: LiveMission,
+    guard: Guard | None,
+    limit_s: float,
+    observer: Callable[[LiveStep, RigidState], None] | None = None,
+) -> list[Sent]:
     """Fly the prepared mission as fast as it goes, and collect what would be sent to its vehicle; ``limit_s`` at most.
 
+    Without a ``guard`` nothing is refused. ``observer`` is called after each step in which the vehicle is commanded, with its body at the step's beginning.
     Raises `LinkError` where a policy commands what cannot be sent.
     """
     live.start()
     live.begin_phases()
-    guard.forget()
+    if guard is not None:
+        guard.forget()
     rows: list[Sent] = []
     flown = False
     while live.time_s < limit_s:
@@ -40,10 +48,13 @@ def rehearse(live: LiveMission, guard: Guard, limit_s: float) -> list[Sent]:
         if not flown and step.in_phase:
             setpoint, refused = setpoint_of(step.command), ""
             try:
-                guard.check(setpoint, step.time_s)
+                if guard is not None:
+                    guard.check(setpoint, step.time_s)
             except RefusedError as error:
                 refused = str(error)
             rows.append(Sent(time_s=step.time_s, setpoint=setpoint, place_m=place, refused=refused))  # type: ignore[arg-type]
+            if observer is not None:
+                observer(step, body)
         if step.begins:
             live.begin_phases()
         if step.over or flown:

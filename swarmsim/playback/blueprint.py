@@ -8,6 +8,7 @@ import rerun.blueprint as rrb
 
 from swarmsim.playback.colours import DRIVEN, measured_phases
 from swarmsim.playback.entities import TIMELINE, measurements_path, measurers, path_of, trails
+from swarmsim.playback.overlay import Overlay, error_view, height_view, side_view, top_view
 from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 
@@ -22,17 +23,35 @@ def site_bounds(site_model: SiteModel) -> tuple[np.ndarray, np.ndarray]:
     return vertices.min(axis=0).astype(float), vertices.max(axis=0).astype(float)
 
 
-def blueprint(record: MissionRecord, site_model: SiteModel) -> rrb.Blueprint:
-    """The layout that is stored with the recording."""
+def blueprint(record: MissionRecord, site_model: SiteModel, overlay: Overlay | None = None) -> rrb.Blueprint:
+    """The layout that is stored with the recording; with the tracks of a vehicle that was flown outside, if given."""
     low, high = site_bounds(site_model)
     spectrum = [_spectrum(record)] if record.sought == "nuclide" else []
-    right = rrb.Vertical(_map(record, low, high), *spectrum, _texts(), row_shares=[1.45, *(1.0 for _ in spectrum), 1.0])
-    return rrb.Blueprint(
+    above: rrb.View | rrb.Container = _map(record, low, high)
+    plots = _plots(record)
+    if overlay is not None:
+        above = rrb.Tabs(top_view(overlay, f"{overlay.vehicle}: planned, simulated, flown", site=True), above)
+        plots = rrb.Horizontal(error_view(overlay, f"{overlay.vehicle}: error [m]"), plots, column_shares=[1.0, 2.0])
+    right = rrb.Vertical(above, *spectrum, _texts(), row_shares=[1.45, *(1.0 for _ in spectrum), 1.0])
+    scene = rrb.Vertical(_scene(record, low, high), plots, row_shares=[2.8, 1.0])
+    return _laid_out(rrb.Horizontal(scene, right, column_shares=[2.1, 1.0]))
+
+
+def track_blueprint(overlay: Overlay, site: bool) -> rrb.Blueprint:
+    """The layout of a flight alone: its tracks from the side and from above, its errors and heights."""
+    plots = rrb.Horizontal(error_view(overlay), height_view(overlay))
+    return _laid_out(
         rrb.Horizontal(
-            rrb.Vertical(_scene(record, low, high), _plots(record), row_shares=[2.8, 1.0]),
-            right,
-            column_shares=[2.1, 1.0],
-        ),
+            rrb.Vertical(side_view(overlay, site), plots, row_shares=[2.0, 1.0]),
+            rrb.Vertical(top_view(overlay, "From above (north up)", site), _log()),
+            column_shares=[1.7, 1.0],
+        )
+    )
+
+
+def _laid_out(views: rrb.Container) -> rrb.Blueprint:
+    return rrb.Blueprint(
+        views,
         rrb.TimePanel(
             state="collapsed",
             timeline=TIMELINE,
@@ -139,9 +158,12 @@ def _spectrum(record: MissionRecord) -> rrb.View:
 
 
 def _texts() -> rrb.Container:
-    log = rrb.TextLogView(
+    return rrb.Tabs(_log("Mission log"), rrb.TextDocumentView(origin="summary", name="Summary"))
+
+
+def _log(name: str = "Log") -> rrb.TextLogView:
+    return rrb.TextLogView(
         origin="log",
-        name="Mission log",
+        name=name,
         columns=rrb.TextLogColumns(timeline_columns=[TIMELINE], text_log_columns=["LogLevel", "Body"]),
     )
-    return rrb.Tabs(log, rrb.TextDocumentView(origin="summary", name="Summary"))

@@ -127,6 +127,11 @@ def draw_site(axes: Axes, site_model: SiteModel) -> None:
     shapes.set_array(above)
     shapes.set_clim(-8.0, max(18.0, float(above.max(initial=0.0)) * 1.4))  # so that the lowest is already a clear grey
     axes.add_collection(shapes)
+    frame_axes(axes)
+
+
+def frame_axes(axes: Axes) -> None:
+    """Scale equal, north up, with an arrow that says so."""
     axes.set_aspect("equal")
     axes.set_xlabel("East [m]")
     axes.set_ylabel("North [m]")

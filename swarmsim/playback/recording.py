@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from swarmsim.playback import growing_map
-from swarmsim.playback.blueprint import blueprint
+from swarmsim.playback.blueprint import blueprint, track_blueprint
 from swarmsim.playback.bodies import shaded
 from swarmsim.playback.colours import (
     ESTIMATE,
@@ -37,6 +38,7 @@ from swarmsim.playback.entities import (
     times,
 )
 from swarmsim.playback.fleet import send_fleet
+from swarmsim.playback.overlay import Overlay, send_overlay
 from swarmsim.playback.scene_marks import send_legend, send_paths, send_sources
 from swarmsim.playback.story import send_log, send_summary
 from swarmsim.playback.vehicles import send_vehicles
@@ -50,19 +52,16 @@ MAP_ABOVE_GROUND_M = 0.35
 MAP_OPACITY = 190  # of 255
 
 
-def write_recording(record: MissionRecord, site_model: SiteModel, path: Path) -> None:
+def write_recording(record: MissionRecord, site_model: SiteModel, path: Path, overlay: Overlay | None = None) -> None:
     """Write the mission as a Rerun recording to ``path`` (``.rrd``), with the blueprint that it opens with.
 
-    Raises whatever Rerun finds wrong: the recording is complete, or there is an error.
+    ``overlay``: the flown, simulated and planned tracks of a vehicle that was flown outside. Raises whatever Rerun finds
+    wrong: the recording is complete, or there is an error.
     """
     record = record.finite()
-    with _strict():
-        stream = rr.RecordingStream("swarmsim", recording_id=f"{record.name}-{record.seed}")
-        stream.set_log_tick_enabled(False)
-        stream.set_log_time_enabled(False)
-        stream.save(path, default_blueprint=blueprint(record, site_model))
+    with _stream(path, f"{record.name}-{record.seed}", blueprint(record, site_model, overlay)) as stream:
         stream.send_recording_name(f"{record.name}, seed {record.seed}")
-        _send_site(stream, site_model)
+        send_site(stream, site_model)
         (send_fleet if is_large(record) else send_vehicles)(stream, record, site_model)
         scales = rate_scales(record)
         for phase in measured_phases(record):
@@ -79,6 +78,31 @@ def write_recording(record: MissionRecord, site_model: SiteModel, path: Path) ->
         _send_spectrum(stream, record)
         send_log(stream, record)
         send_summary(stream, record)
+        if overlay is not None:
+            send_overlay(stream, overlay)
+
+
+def write_track_recording(overlay: Overlay, site_model: SiteModel | None, path: Path) -> None:
+    """Write a flight as a Rerun recording to ``path``: its tracks, in the site if there is one, and its errors.
+
+    Raises whatever Rerun finds wrong, as `write_recording`.
+    """
+    with _stream(path, f"flight-{overlay.vehicle}", track_blueprint(overlay, site_model is not None)) as stream:
+        stream.send_recording_name(f"flight of {overlay.vehicle}")
+        if site_model is not None:
+            send_site(stream, site_model)
+        send_overlay(stream, overlay)
+
+
+@contextmanager
+def _stream(path: Path, recording_id: str, layout: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
+    """A recording into a file, written when the block ends."""
+    with _strict():
+        stream = rr.RecordingStream("swarmsim", recording_id=recording_id)
+        stream.set_log_tick_enabled(False)
+        stream.set_log_time_enabled(False)
+        stream.save(path, default_blueprint=layout)
+        yield stream
         stream.flush()
         stream.disconnect()
 
@@ -101,7 +125,8 @@ def _drawn(samples: Samples, total: int) -> NDArray[np.intp]:
     return np.sort(np.concatenate(kept))
 
 
-def _send_site(stream: rr.RecordingStream, site_model: SiteModel) -> None:
+def send_site(stream: rr.RecordingStream, site_model: SiteModel) -> None:
+    """The site's mesh, and which way is up."""
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)  # type: ignore[attr-defined]
     mesh = site_model.mesh
     stream.log("world/site", mesh3d(shaded(mesh.vertices_m, mesh.triangles, mesh.colours)), static=True)

@@ -124,6 +124,34 @@ class LiveMission:
         k, body = self.seat.local, self._mission.world.groups[self.seat.group].vehicle.body
         return jax.tree.map(lambda x: np.array(x)[0, k], body)  # a copy: the next step takes the arrays over
 
+    def team(self) -> tuple[tuple[str, np.ndarray, np.ndarray], ...]:
+        """Name, position [3] and attitude [4] (w x y z) of every vehicle, in the order of the mission's."""
+        names = [member.name for member in self._simulation.scenario.members]
+        found: list[tuple[str, np.ndarray, np.ndarray] | None] = [None] * len(names)
+        for group, state in zip(self._simulation.world.groups, self._mission.world.groups, strict=True):
+            body = state.vehicle.body
+            poses = zip(
+                np.asarray(group.member), np.array(body.position_m)[0], np.array(body.quaternion)[0], strict=True
+            )
+            for number, position, quaternion in poses:
+                found[number] = names[number], position, quaternion
+        return tuple(each for each in found if each is not None)
+
+    def count_rates_cps(self) -> dict[str, float]:
+        """Count rate of the last exposure of every vehicle with a detector, by its name."""
+        names = [member.name for member in self._simulation.scenario.members]
+        rates: dict[str, float] = {}
+        for group, state in zip(self._simulation.world.groups, self._mission.world.groups, strict=True):
+            if state.counter is not None:
+                values = np.array(state.counter.reading.rate_cps)[0]
+                rates |= {names[n]: float(v) for n, v in zip(np.asarray(group.member), values, strict=True)}
+        return rates
+
+    def phase(self) -> str | None:
+        """Name of the phase that the vehicle is in."""
+        number = int(np.asarray(self._mission.phase_of[self.seat.group])[0, self.seat.local])
+        return None if number < 0 else self._simulation.plan.phases[number].name
+
     def path_m(self) -> np.ndarray | None:
         """The path [P, 3] of the phase that the vehicle is in, if that follows one."""
         number = int(np.asarray(self._mission.phase_of[self.seat.group])[0, self.seat.local])

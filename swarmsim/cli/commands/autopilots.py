@@ -176,3 +176,56 @@ def sitl(
     from swarmsim.cli.sitl import run_sitl
 
     return run_sitl(scenario, autopilot, names, vehicles, speed, duration, start, seed, overrides, out, force)
+
+
+@command(name="replay-log")
+def replay_log(
+    file: Path,
+    *,
+    run: Path | None = None,
+    mission: str | None = None,
+    vehicle: str | None = None,
+    seed: Annotated[int | None, Parameter(validator=Number(gte=0, lt=SEED_END), converter=whole)] = None,
+    overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
+    system: Annotated[int | None, Parameter(validator=Number(gte=1, lte=255), converter=whole)] = None,
+    origin: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
+    out: Path | None = None,
+    force: bool = False,
+) -> None:
+    """Read the log of a flight (.tlog, dataflash .bin, PX4 .ulg), and lay it over a mission's plan and simulation.
+
+    For example:
+        swarmsim replay-log flight.tlog
+        swarmsim replay-log 00000001.BIN --mission recon --vehicle uav1
+        swarmsim replay-log 10_31_07.ulg --run runs/recon_uav1
+        swarmsim replay-log flight.tlog --system 2 --origin 49.2275,16.5747,280
+
+    Prints and writes the errors; 'swarmsim view FOLDER' shows the tracks.
+
+    Parameters
+    ----------
+    file
+        The log.
+    run
+        Folder of a run of 'swarmsim fly' or 'swarmsim run', whose mission the flight is compared with.
+    mission
+        Name of a mission, or a mission file, that the flight is compared with.
+    vehicle
+        Vehicle of the mission that the log is of; by default the one that was flown in the run.
+    seed
+        Seed of the mission, in the stead of its own.
+    overrides
+        Change a value of the mission, as path=value; may be given again and again.
+    system
+        System id of the vehicle, where the log holds several.
+    origin
+        Place on the Earth of the mission's origin, LAT,LON,ALT in degrees and metres; by default the flight is laid
+        over the mission where it began.
+    out
+        Folder of the results; runs/log_NAME by default.
+    force
+        Replace earlier results.
+    """
+    from swarmsim.cli.replay_log import replay_log as replay
+
+    replay(file, run, mission, vehicle, seed, overrides, system, origin, out, force)

@@ -1,0 +1,225 @@
+"""What ``swarmsim replay-log`` does."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from swarmsim.config.errors import InputError, file_errors_told
+from swarmsim.results.names import FIGURES, RECORDING, SCENARIO
+
+if TYPE_CHECKING:
+    from swarmsim.autopilot.compare import Comparison, Planned, Simulated
+    from swarmsim.autopilot.frames import Geodetic
+    from swarmsim.autopilot.logs.flight_log import FlightLog
+    from swarmsim.site.model import SiteModel
+
+REPORT, TRACK = "log.json", "track.parquet"
+_FLOWN = "flown.json"  # of a run's folder
+_MODES = 12  # lines of the table
+
+
+@dataclass(frozen=True)
+class _Mission:
+    """What a log is compared with."""
+
+    vehicle: str
+    site_model: "SiteModel"
+    simulated: "Simulated"
+    planned: "tuple[Planned, ...]"
+
+
+def replay_log(
+    file: Path, run: Path | None, mission: str | None, vehicle: str | None, seed: int | None,
+    overrides: Sequence[str], system: int | None, origin: str | None, out: Path | None, force: bool,
+) -> None:  # fmt: skip
+    """Read a log, compare it with the mission if one is named, tell the errors and write a folder with all of it."""
+    from swarmsim.autopilot.logs.reading import read_log
+
+    console = Console()
+    place = None if origin is None else _geodetic(origin)
+    folder = out if out is not None else Path("runs") / f"log_{file.stem}"
+    check_folder(folder, force)
+    source = _source(run, mission, vehicle)
+    log = read_log(file, system)
+    if place is not None and log.origin is None:
+        raise InputError.of(
+            "the log does not tell where on the Earth its positions are", path="--origin",
+            suggestion="leave --origin out: the tracks are then laid over one another where the flight began",
+        )  # fmt: skip
+    for note in log.notes:
+        console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
+    log = log if place is None else log.moved_to(place)
+    found = None if source is None else _mission(*source, seed, overrides, run, console)
+    aligned = "the log's origin" if place is None else f"--origin {origin}"
+    if found is not None and place is None:
+        log, aligned = _aligned(log, found), "where the flight began"
+    _write(file, folder, force, log, found, aligned, console)
+
+
+def check_folder(folder: Path, force: bool) -> None:
+    """Raise `InputError` unless the results of a log can be written to ``folder``, which then is another such folder."""
+    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+        raise InputError.of("there is something else than a folder there", path="--out", given=str(folder))
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    hint = "choose another folder with --out"
+    if not (folder / REPORT).is_file():
+        raise InputError.of(
+            f"the folder holds something else than a log's results, and is not replaced (no {REPORT} in it)",
+            path="--out", given=str(folder), suggestion=hint,
+        )  # fmt: skip
+    if not force:
+        hint += ", or replace them with --force"
+        raise InputError.of("there are results already", path="--out", given=str(folder), suggestion=hint)
+
+
+def _geodetic(text: str) -> "Geodetic":
+    from swarmsim.autopilot.frames import Geodetic
+
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    latitude, longitude, altitude = numbers if len(numbers) == 3 else (np.nan, np.nan, np.nan)
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(altitude) <= 20_000.0):
+        raise InputError.of(
+            "this is no place on the Earth", path="--origin", given=text, allowed="LAT,LON,ALT in degrees and metres"
+        )
+    return Geodetic(latitude, longitude, altitude)
+
+
+def _source(run: Path | None, mission: str | None, vehicle: str | None) -> tuple[str, str] | None:
+    """Mission file or name, and vehicle, that the log is compared with; None where none is named."""
+    if run is not None and mission is not None:
+        raise InputError.of("name a run or a mission, not both", path="--run")
+    if run is None and mission is None:
+        if vehicle is not None:
+            raise InputError.of("of which mission?", path="--vehicle", suggestion="add --mission or --run")
+        return None
+    if run is not None:
+        if not (run / SCENARIO).is_file():
+            raise InputError.of(f"is not the folder of a run (no {SCENARIO} in it)", path="--run", given=str(run))
+        vehicle = vehicle or _flown_vehicle(run)
+        mission = str(run / SCENARIO)
+    if vehicle is None:
+        raise InputError.of("say which vehicle of the mission the log is of", path="--vehicle")
+    return str(mission), vehicle
+
+
+def _flown_vehicle(run: Path) -> str | None:
+    """The vehicle that was flown outside in a run."""
+    try:
+        return str(json.loads((run / _FLOWN).read_text(encoding="utf-8"))["vehicle"])
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError.of("is damaged", file=run / _FLOWN, suggestion="name the vehicle with --vehicle") from error
+
+
+def _mission(
+    name: str, vehicle: str, seed: int | None, overrides: Sequence[str], run: Path | None, console: Console
+) -> _Mission:
+    from swarmsim.autopilot.simulated import has_simulated, read_simulated, simulate_vehicle
+    from swarmsim.config.scenario import load_scenario
+    from swarmsim.runtime.devices import use_all_cores
+    from swarmsim.runtime.run import build
+
+    scenario = load_scenario(name, overrides, seed)
+    names = [member.name for member in scenario.members]
+    if vehicle not in names:
+        raise InputError.of(
+            "the mission has no such vehicle", path="--vehicle", given=vehicle, allowed=", ".join(names)
+        )
+    use_all_cores()
+    simulation = build(scenario)
+    if run is not None and has_simulated(run) and vehicle == _flown_vehicle(run) and not overrides and seed is None:
+        simulated, planned = read_simulated(run)
+    else:
+        with console.status("fly the mission in simulation"):
+            simulated, planned = simulate_vehicle(simulation, vehicle)
+    return _Mission(vehicle, simulation.site_model, simulated, planned)
+
+
+def _aligned(log: "FlightLog", mission: _Mission) -> "FlightLog":
+    """The log with the place where its flight began laid on the vehicle's start in the mission."""
+    began = int(np.searchsorted(log.time_s, log.spans_s()[0][0]))
+    start = log.position_m[min(began, len(log.time_s) - 1)]
+    return log.shifted(mission.simulated.track.position_m[0] - start)
+
+
+def _write(
+    file: Path, folder: Path, force: bool, log: "FlightLog", mission: _Mission | None, aligned: str, console: Console
+) -> None:
+    import pyarrow.parquet as pq
+
+    from swarmsim.atomic_folder import atomic_folder
+    from swarmsim.autopilot.compare import Track, compare
+    from swarmsim.autopilot.logs.tables import report, track_table
+    from swarmsim.playback.flown_figure import write_figure
+    from swarmsim.playback.overlay import Overlay
+    from swarmsim.playback.recording import write_track_recording
+
+    flown, spans = Track(log.time_s, log.position_m), log.spans_s()
+    made = compare(flown, mission.planned, mission.simulated, spans) if mission else compare(flown, spans_s=spans)
+    overlay = Overlay(
+        vehicle=mission.vehicle if mission else f"{log.autopilot} {log.vehicle}",
+        flown=flown,
+        comparison=made,
+        planned=mission.planned if mission else (),
+        simulated=mission.simulated if mission else None,
+        marks=tuple(sorted((c.time_s, c.name) for c in (*log.modes, *log.armed, *log.messages))),
+    )
+    site_model = mission.site_model if mission else None
+    summary = {"file": file.name} | report(log) | {"aligned": aligned}
+    summary |= {"vehicle_of_mission": mission.vehicle, "comparison": made.report()} if mission else {}
+    told = file_errors_told("the results cannot be written there", path="--out", given=str(folder))
+    with told, atomic_folder(folder, lambda target: check_folder(target, force)) as new:
+        pq.write_table(track_table(log), new / TRACK, compression="zstd")
+        (new / REPORT).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_track_recording(overlay, site_model, new / RECORDING)
+        write_figure(overlay, site_model, new / FIGURES)
+    _print(log, made if mission else None, console)
+    console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
+
+
+def _print(log: "FlightLog", made: "Comparison | None", console: Console) -> None:
+    table = Table("flight", "value", title_justify="left")
+    who = f"{log.autopilot} {log.vehicle}" + ("" if log.system is None else f", system {log.system}")
+    table.add_row("Vehicle", escape(who))
+    table.add_row("Log", f"{log.time_s[-1]:.1f} s, {len(log.time_s):,} positions")
+    table.add_row("Judged", ", ".join(f"{a:.1f} s to {b:.1f} s" for a, b in log.spans_s()[:_MODES]))
+    modes = [f"{change.time_s:.1f} s {change.name}" for change in log.modes]
+    table.add_row("Modes", escape("\n".join(modes[:_MODES] + ["…"] * (len(modes) > _MODES))))
+    low, high = log.position_m.min(axis=0), log.position_m.max(axis=0)
+    table.add_row("Extent", " x ".join(f"{v:.1f} m" for v in high - low))
+    console.print(table)
+    if made is not None:
+        print_comparison(made.report(), console)
+
+
+def print_comparison(summary: dict[str, Any], console: Console) -> None:
+    """Print the errors of a comparison, as `Comparison.report` sums them up."""
+    shift = summary["time_shift_s"]
+    title = "errors [m]" + ("" if shift is None else f", simulated times shifted by {shift:.2f} s")
+    table = Table("error", "where", "rms", "95 %", "greatest", title=title, title_justify="left")
+    for name, label in (
+        ("cross_track", "Horizontal, from the planned path"),
+        ("synchronised", "Horizontal, from the simulated vehicle at the same time"),
+        ("from_simulated_track", "Horizontal, from the simulated track"),
+        ("above_simulated", "Vertical, from the simulated vehicle at the same time"),
+    ):
+        for key, where in (("whole", "all"), ("on_lines", "on the lines")):
+            told = summary[key][name]
+            if told is not None:
+                table.add_row(label, where, *(f"{told[each]:.2f}" for each in ("rms_m", "p95_m", "max_m")))
+    if table.row_count:
+        console.print(table)
+    else:
+        console.print("nothing of the flight can be compared with the mission: see 'Judged'", highlight=False)
