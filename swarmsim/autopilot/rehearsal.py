@@ -31,21 +31,19 @@ def rehearse(
 ) -> list[Sent]:
     """Fly the prepared mission as fast as it goes, and collect what would be sent to its vehicle; ``limit_s`` at most.
 
-    Without a ``guard`` nothing is refused. ``observer`` is called after each step in which the vehicle is commanded, with its body at the step's beginning.
-    Raises `LinkError` where a policy commands what cannot be sent.
+    Without a ``guard`` nothing is refused. ``observer`` is called after each step in which the vehicle is commanded,
+    with its body at the step's beginning. Raises `LinkError` where a policy commands what cannot be sent.
     """
     live.start()
     live.begin_phases()
     if guard is not None:
         guard.forget()
     rows: list[Sent] = []
-    flown = False
     while live.time_s < limit_s:
         body = live.body()
         place = tuple(float(v) for v in body.position_m)
         step = live.step(body, 1.0)
-        flown = flown or (bool(rows) and not step.in_phase and not step.begins)
-        if not flown and step.in_phase:
+        if step.in_phase:
             setpoint, refused = setpoint_of(step.command), ""
             try:
                 if guard is not None:
@@ -57,7 +55,7 @@ def rehearse(
                 observer(step, body)
         if step.begins:
             live.begin_phases()
-        if step.over or flown:
+        if step.over or not (step.in_phase or step.begins or live.has_phase_to_come()):
             break
     return rows
 

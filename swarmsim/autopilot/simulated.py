@@ -1,5 +1,6 @@
 """The simulated track that a flight is compared with: the same mission flown by its own simulated vehicle."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,7 +12,6 @@ from swarmsim.autopilot.compare import Planned, Simulated, Track
 from swarmsim.autopilot.link import LinkError
 from swarmsim.autopilot.rehearsal import rehearse
 from swarmsim.config.errors import InputError, file_errors_told
-from swarmsim.config.scenario import Scenario
 from swarmsim.runtime.live import LiveMission, LiveStep
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.vehicles.state import RigidState
@@ -26,13 +26,15 @@ class _Seen:
     """Rows of a rehearsal, and the paths of its phases."""
 
     live: LiveMission
+    names: Sequence[str]  # of the mission's phases
     rows: list[tuple[float, ...]] = field(default_factory=list)
     phases: list[int] = field(default_factory=list)
     planned: list[Planned] = field(default_factory=list)
     _name: str | None = None
 
     def __call__(self, step: LiveStep, body: RigidState) -> None:
-        name = self.live.phase()
+        number = self.live.phase()
+        name = None if number is None else self.names[number]
         if name != self._name or len(self.rows) % _CHECK_STEPS == 0:
             self._name = name
             self._look(name)
@@ -46,20 +48,16 @@ class _Seen:
             self.planned.append(Planned(str(name), np.asarray(path, np.float64)))
 
 
-def simulate(live: LiveMission, limit_s: float, seed: int) -> tuple[Simulated, tuple[Planned, ...]]:
+def simulate(simulation: Simulation, live: LiveMission) -> tuple[Simulated, tuple[Planned, ...]]:
     """The track of the simulated vehicle in the prepared mission, while it is commanded, and the paths that it plans.
 
     Takes the mission back to its beginning. Raises `LinkError` as `rehearse` does.
     """
-    seen = _Seen(live)
-    rehearse(live, None, limit_s, seen)
+    mission = simulation.scenario.mission
+    seen = _Seen(live, [phase.name for phase in simulation.plan.phases])
+    rehearse(live, None, float(sum(phase.time_limit_s for phase in mission.phases)), seen)
     rows = np.asarray(seen.rows, np.float64).reshape(-1, 4)
-    return Simulated(Track(rows[:, 0], rows[:, 1:]), np.array(seen.phases, int), seed), tuple(seen.planned)
-
-
-def time_limit_s(scenario: Scenario) -> float:
-    """Longest time that the mission may take."""
-    return float(sum(phase.time_limit_s for phase in scenario.mission.phases))
+    return Simulated(Track(rows[:, 0], rows[:, 1:]), np.array(seen.phases, int), mission.seed), tuple(seen.planned)
 
 
 def write_simulated(folder: Path, simulated: Simulated, planned: tuple[Planned, ...]) -> None:
@@ -103,10 +101,11 @@ def simulate_vehicle(simulation: Simulation, vehicle: str) -> tuple[Simulated, t
 
     Raises `InputError` where its policy commands what cannot be sent to a real vehicle.
     """
-    scenario = simulation.scenario
-    live = LiveMission(simulation, scenario.mission.seed, vehicle)
+    live = LiveMission(simulation, simulation.scenario.mission.seed, vehicle)
+    if not live.has_part:
+        raise InputError.of("the vehicle has no part in the mission", path="--vehicle", given=vehicle)
     live.prepare()
     try:
-        return simulate(live, time_limit_s(scenario), scenario.mission.seed)
+        return simulate(simulation, live)
     except LinkError as error:
         raise InputError.of(f"the mission cannot be flown outside: {error}", path="--vehicle", given=vehicle) from error

@@ -64,7 +64,7 @@ def replay_log(
 
 
 def check_folder(folder: Path, force: bool) -> None:
-    """Raise `InputError` unless the results of a log can be written to ``folder``, which then is another such folder."""
+    """Raise `InputError` unless a log's results can be written to ``folder``; with ``force`` others are replaced."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise InputError.of("there is something else than a folder there", path="--out", given=str(folder))
     if not folder.is_dir() or not any(folder.iterdir()):
@@ -171,6 +171,7 @@ def _write(
     overlay = Overlay(
         vehicle=mission.vehicle if mission else f"{log.autopilot} {log.vehicle}",
         flown=flown,
+        judged=flown.within(spans),
         comparison=made,
         planned=mission.planned if mission else (),
         simulated=mission.simulated if mission else None,
@@ -207,7 +208,7 @@ def _print(log: "FlightLog", made: "Comparison | None", console: Console) -> Non
 def print_comparison(summary: dict[str, Any], console: Console) -> None:
     """Print the errors of a comparison, as `Comparison.report` sums them up."""
     shift = summary["time_shift_s"]
-    title = "errors [m]" + ("" if shift is None else f", simulated times shifted by {shift:.2f} s")
+    title = "errors in m" + ("" if shift is None else f", simulated times shifted by {shift:.2f} s")
     table = Table("error", "where", "rms", "95 %", "greatest", title=title, title_justify="left")
     for name, label in (
         ("cross_track", "Horizontal, from the planned path"),

@@ -1,5 +1,6 @@
 """How the viewer opens a mission: the scene large, the map, the plots, the spectrum and the log around it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -49,13 +50,36 @@ def track_blueprint(overlay: Overlay, site: bool) -> rrb.Blueprint:
     )
 
 
-def _laid_out(views: rrb.Container) -> rrb.Blueprint:
+def live_blueprint(site_model: SiteModel, names: Sequence[str], vehicle: str) -> rrb.Blueprint:
+    """The layout of a mission under way, with ``vehicle`` flown outside."""
+    low, high = site_bounds(site_model)
+    growing = _so_far([path_of("world/trails", name) for name in names])
+    plots = [
+        rrb.TimeSeriesView(origin=origin, name=name)
+        for origin, name in (
+            ("plots/error", f"{vehicle}: distance from the setpoint [m]"),
+            ("plots/height", "Height [m]"),
+            ("plots/rate", "Count rate [1/s]"),
+            ("plots/battery", f"{vehicle}: battery [%]"),
+        )
+    ]
+    return _laid_out(
+        rrb.Horizontal(
+            rrb.Vertical(_side(low, high, growing), rrb.Horizontal(*plots[:2]), row_shares=[2.4, 1.0]),
+            rrb.Vertical(_above("From above (north up)", [], low, high, growing), rrb.Tabs(*plots[2:]), _log()),
+            column_shares=[1.7, 1.0],
+        ),
+        playback_speed=1.0,
+    )
+
+
+def _laid_out(views: rrb.Container, playback_speed: float = _PLAYBACK_SPEED) -> rrb.Blueprint:
     return rrb.Blueprint(
         views,
         rrb.TimePanel(
             state="collapsed",
             timeline=TIMELINE,
-            playback_speed=_PLAYBACK_SPEED,
+            playback_speed=playback_speed,
             play_state="following",
             loop_mode="off",
         ),
@@ -68,52 +92,60 @@ def _laid_out(views: rrb.Container) -> rrb.Blueprint:
 
 def _growing(record: MissionRecord) -> dict[Any, rrb.VisibleTimeRanges]:
     """Trails and measurements show everything up to the time cursor; all else shows its latest state."""
-    so_far = rrb.VisibleTimeRanges(
-        timeline=TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-    )
     paths = [path_of("world/trails", name) for name in trails(record)]
     for phase in measured_phases(record):
         paths += [path_of(measurements_path(phase.name), name) for name in measurers(record, phase)]
-    return dict.fromkeys(paths, so_far)
+    return _so_far(paths)
+
+
+def _so_far(paths: list[str]) -> dict[Any, rrb.VisibleTimeRanges]:
+    span = rrb.VisibleTimeRanges(
+        timeline=TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
+    return dict.fromkeys(paths, span)
 
 
 def _scene(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatial3DView:
+    return _side(low, high, _growing(record))
+
+
+def _side(low: np.ndarray, high: np.ndarray, growing: dict[Any, rrb.VisibleTimeRanges]) -> rrb.Spatial3DView:
     """The site from the south, a little from the west, so that its longer side lies across the view."""
     centre = 0.5 * (low + high)
     across = float(np.hypot(*(high - low)[:2]))
-    return rrb.Spatial3DView(
-        name="Mission",
-        origin="world",
-        contents=["+ world/**"],
-        background=rrb.Background(color=_BACKGROUND),
-        line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=centre + across * np.array([-0.09, -0.61, 0.44]),
-            look_target=centre + across * np.array([0.0, -0.10, 0.0]),
-            eye_up=[0.0, 0.0, 1.0],
-        ),
-        overrides=_growing(record),
-    )
+    eye = centre + across * np.array([-0.09, -0.61, 0.44])
+    return _view("Mission", [], eye, centre + across * np.array([0.0, -0.10, 0.0]), [0.0, 0.0, 1.0], growing)
 
 
 def _map(record: MissionRecord, low: np.ndarray, high: np.ndarray) -> rrb.Spatial3DView:
     """The scene from straight above, north up, without the points measured in flight, which would hide the map."""
+    flown = [phase.name for phase in measured_phases(record) if record.map is not None and record.is_flown(phase)]
+    hidden = ["world/labels", f"world/legend/{DRIVEN}", *map(measurements_path, flown)]
+    name = "Map (north up)" if record.map is not None else "From above (north up)"
+    return _above(name, hidden, low, high, _growing(record))
+
+
+def _above(
+    name: str, hidden: list[str], low: np.ndarray, high: np.ndarray, growing: dict[Any, rrb.VisibleTimeRanges]
+) -> rrb.Spatial3DView:
     centre, size = 0.5 * (low + high), high - low
     target = centre - [0.0, 0.04 * size[1], 0.0]  # room for the legend along the south edge
     eye = target + np.array([0.0, 0.0, 1.2 * max(size[1], 0.7 * size[0])])
-    flown = [phase.name for phase in measured_phases(record) if record.map is not None and record.is_flown(phase)]
-    hidden = ["world/labels", f"world/legend/{DRIVEN}", *map(measurements_path, flown)]
+    return _view(name, hidden, eye, target, [0.0, 1.0, 0.0], growing)
+
+
+def _view(
+    name: str, hidden: list[str], eye: np.ndarray, target: np.ndarray, up: list[float],
+    growing: dict[Any, rrb.VisibleTimeRanges],
+) -> rrb.Spatial3DView:  # fmt: skip
     return rrb.Spatial3DView(
-        name="Map (north up)" if record.map is not None else "From above (north up)",
+        name=name,
         origin="world",
         contents=["+ world/**", *(f"- {path}/**" for path in hidden)],
         background=rrb.Background(color=_BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=[0.0, 1.0, 0.0]
-        ),
-        overrides=_growing(record),
+        eye_controls=rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye, look_target=target, eye_up=up),
+        overrides=growing,
     )
 
 

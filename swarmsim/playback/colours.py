@@ -1,5 +1,6 @@
 """Colours of everything that is drawn: vehicles, count rates, marks of sources; safe for colour-blind readers."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib
@@ -7,7 +8,7 @@ import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
-from swarmsim.results.record import MissionRecord, Phase, Samples
+from swarmsim.results.record import MissionRecord, Phase, Samples, VehicleRecord
 
 # Okabe & Ito (2008), "Color universal design", without its black and its yellow (too pale on paper).
 _FLYING = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
@@ -20,9 +21,14 @@ FLOWN, DRIVEN = "flown", "driven"
 
 
 def vehicle_colours(record: MissionRecord) -> list[str]:
+    """A colour (hex) for each vehicle of a mission."""
+    return team_colours(record.vehicles)
+
+
+def team_colours(vehicles: Sequence[VehicleRecord]) -> list[str]:
     """A colour (hex) for each vehicle: rovers and multirotors each cycle through colours of their own."""
     colours, used = [], {True: 0, False: 0}
-    for vehicle in record.vehicles:
+    for vehicle in vehicles:
         palette = _FLYING if vehicle.flies else _DRIVING
         colours.append(palette[used[vehicle.flies] % len(palette)])
         used[vehicle.flies] += 1

@@ -38,8 +38,8 @@ def flown_figure(overlay: Overlay, site_model: SiteModel | None) -> Figure:
     figure = plan.new_figure(plan.DOUBLE_COLUMN_IN, _HEIGHT_IN)
     _draw_above(figure.add_axes(_LEFT), overlay, site_model)
     if _has_errors(overlay):
-        errors = figure.add_axes((_RIGHT[0], 0.56, _RIGHT[1], 0.285))
-        heights = figure.add_axes((_RIGHT[0], 0.125, _RIGHT[1], 0.285), sharex=errors)
+        errors = figure.add_axes((_RIGHT[0], 0.51, _RIGHT[1], 0.335))
+        heights = figure.add_axes((_RIGHT[0], 0.125, _RIGHT[1], 0.335), sharex=errors)
         _draw_errors(errors, overlay)
         errors.tick_params(labelbottom=False)
     else:
@@ -51,12 +51,6 @@ def flown_figure(overlay: Overlay, site_model: SiteModel | None) -> Figure:
 def _has_errors(overlay: Overlay) -> bool:
     made = overlay.comparison
     return bool(np.isfinite(made.cross_track_m).any() or np.isfinite(made.synchronised_m).any())
-
-
-def _judged(overlay: Overlay) -> NDArray[np.float64]:
-    """Flown positions [k, 3] at the times that are judged; the whole track where none is."""
-    made = overlay.comparison
-    return overlay.flown.at(made.time_s) if len(made.time_s) > 1 else overlay.flown.position_m
 
 
 def _draw_above(axes: Axes, overlay: Overlay, site_model: SiteModel | None) -> None:
@@ -72,7 +66,7 @@ def _draw_above(axes: Axes, overlay: Overlay, site_model: SiteModel | None) -> N
     if overlay.simulated is not None:
         x, y = _thin(overlay.simulated.track.position_m)[:, :2].T
         handles += axes.plot(x, y, "-", color=SIMULATED, linewidth=1.1, label="simulated", zorder=4)
-    x, y = _thin(_judged(overlay))[:, :2].T
+    x, y = _thin(overlay.judged.position_m)[:, :2].T
     handles += axes.plot(x, y, "-", color=FLOWN, linewidth=0.8, label="flown", zorder=5)
     axes.plot(x[:1], y[:1], "s", color=FLOWN, markersize=3.0, markeredgecolor="black", markeredgewidth=0.4, zorder=6)
     start = {"linestyle": "none", "marker": "s", "color": "0.8", "markeredgecolor": "black", "markersize": 3.0}
@@ -114,8 +108,7 @@ def _draw_errors(axes: Axes, overlay: Overlay) -> None:
 
 
 def _draw_heights(axes: Axes, overlay: Overlay) -> None:
-    made = overlay.comparison
-    track = overlay.simulated_track()
+    track, judged = overlay.simulated_track(), overlay.judged
     handles = []
     if track is not None:
         handles += axes.plot(
@@ -123,10 +116,9 @@ def _draw_heights(axes: Axes, overlay: Overlay) -> None:
         )
     handles += axes.plot(overlay.flown.time_s, overlay.flown.position_m[:, 2], "-", color=FLOWN, linewidth=0.8,
                          label="flown")  # fmt: skip
-    if len(made.time_s) > 1:
-        axes.set_xlim(made.time_s[0], made.time_s[-1])
-        shown = np.concatenate([_judged(overlay)[:, 2], *([] if track is None else [track.position_m[:, 2]])])
-        shown = shown[np.isfinite(shown)]
+    if len(judged.time_s) > 1:
+        axes.set_xlim(judged.time_s[0], judged.time_s[-1])
+        shown = np.concatenate([judged.position_m[:, 2], *([] if track is None else [track.position_m[:, 2]])])
         room = max(0.08 * float(np.ptp(shown)), 0.25)
         axes.set_ylim(float(shown.min()) - room, float(shown.max()) + room)
     axes.set_xlabel("Time [s]")

@@ -27,6 +27,7 @@ class Overlay:
 
     vehicle: str
     flown: Track
+    judged: Track  # the part of the flown track that is compared
     comparison: Comparison
     planned: tuple[Planned, ...] = ()
     simulated: Simulated | None = None
@@ -43,8 +44,7 @@ class Overlay:
         """Lowest and highest corner [3] of what was judged, the paths and the simulated track."""
         parts = [path.points_m for path in self.planned]
         parts += [self.simulated.track.position_m] if self.simulated is not None else []
-        judged = self.flown.at(self.comparison.time_s)
-        parts += [judged[np.isfinite(judged).all(axis=1)]]
+        parts += [self.judged.position_m]
         every = np.concatenate([part for part in parts if len(part)] or [self.flown.position_m])
         return every.min(axis=0), every.max(axis=0)
 
@@ -81,12 +81,14 @@ def send_overlay(stream: rr.RecordingStream, overlay: Overlay) -> None:
 
 def error_view(overlay: Overlay, name: str = "Flown: error [m]") -> rrb.TimeSeriesView:
     """The errors over the time that was judged."""
-    return _plot(ERRORS, name, overlay)
+    made = overlay.comparison
+    return _plot(ERRORS, name, overlay, made.cross_track_m, made.synchronised_m, made.above_m)
 
 
 def height_view(overlay: Overlay) -> rrb.TimeSeriesView:
     """Heights of the flown and the simulated vehicle."""
-    return _plot(f"{STATES}/height", "Height [m]", overlay)
+    tracks = [track for track in (overlay.judged, overlay.simulated_track()) if track is not None]
+    return _plot(f"{STATES}/height", "Height [m]", overlay, *(track.position_m[:, 2] for track in tracks))
 
 
 def top_view(overlay: Overlay, name: str, site: bool) -> rrb.Spatial3DView:
@@ -125,13 +127,18 @@ def side_view(overlay: Overlay, site: bool) -> rrb.Spatial3DView:
     )
 
 
-def _plot(origin: str, name: str, overlay: Overlay) -> rrb.TimeSeriesView:
-    span = overlay.comparison.time_s if len(overlay.comparison.time_s) > 1 else overlay.flown.time_s
+def _plot(origin: str, name: str, overlay: Overlay, *shown: NDArray[np.floating]) -> rrb.TimeSeriesView:
+    """A plot over the judged time, with room for all that is ``shown`` and for the legend above it."""
+    span = overlay.judged.time_s if len(overlay.judged.time_s) > 1 else overlay.flown.time_s
     start, end = (rrb.TimeRangeBoundary.absolute(seconds=float(span[k])) for k in (0, -1))
+    values = np.concatenate([each[np.isfinite(each)] for each in shown] or [np.zeros(0)])
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    room = max(0.1 * (high - low), 0.05)
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+        axis_y=rrb.ScalarAxis(range=(low - room, high + 4.0 * room)),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
     )
 

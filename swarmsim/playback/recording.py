@@ -55,7 +55,7 @@ MAP_OPACITY = 190  # of 255
 def write_recording(record: MissionRecord, site_model: SiteModel, path: Path, overlay: Overlay | None = None) -> None:
     """Write the mission as a Rerun recording to ``path`` (``.rrd``), with the blueprint that it opens with.
 
-    ``overlay``: the flown, simulated and planned tracks of a vehicle that was flown outside. Raises whatever Rerun finds
+    ``overlay``: flown, simulated and planned tracks of a vehicle that was flown outside. Raises whatever Rerun finds
     wrong: the recording is complete, or there is an error.
     """
     record = record.finite()

@@ -48,6 +48,12 @@ def _send_body(stream: rr.RecordingStream, vehicle: VehicleRecord, colour: str, 
     xyzw = vehicle.quaternion[keep][:, [1, 2, 3, 0]]
     poses = rr.Transform3D.columns(translation=vehicle.position_m[keep], quaternion=xyzw)
     stream.send_columns(path, times(time), poses)
+    send_look(stream, vehicle, colour)
+
+
+def send_look(stream: rr.RecordingStream, vehicle: VehicleRecord, colour: str) -> None:
+    """Body and name of a vehicle, below the entity that has its poses."""
+    path = path_of("world/vehicles", vehicle.name)
     body = vehicle_mesh(vehicle, colour, BODY_SCALE[vehicle.kind])
     stream.log(f"{path}/body", mesh3d(body), static=True)
     label = rr.Points3D(

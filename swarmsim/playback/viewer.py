@@ -1,12 +1,21 @@
 """Open a run's recording in the Rerun viewer."""
 
+import contextlib
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.names import one_of
 from swarmsim.results.names import RECORDING
+
+LIVE_PORT = 9876  # Rerun's own
+_START_S = 30.0  # that the viewer may take to open
+_ANSWER_S = 2.0
+_OPENS_S = 0.5
 
 
 def recording_of(run: Path) -> Path:
@@ -36,3 +45,52 @@ def open_recording(run: Path, web: bool = False) -> None:
     if ended.returncode != 0:
         hint = None if web else "on a machine without a display, use --web"
         raise InputError.of(f"the Rerun viewer ended with exit code {ended.returncode}", suggestion=hint)
+
+
+def live_address(url: str | None, port: int = LIVE_PORT) -> str:
+    """The address of a viewer to send to: ``url`` if given, else that of the desktop's, which is started if need be.
+
+    Raises `InputError` where no viewer answers, and where the desktop's cannot start (no display, no graphics).
+    """
+    if url is None:
+        if not _answers("127.0.0.1", port):
+            _start_viewer([sys.executable, "-m", "rerun", "--port", str(port)], port)
+        return f"rerun+http://127.0.0.1:{port}/proxy"
+    try:
+        parts = urlsplit(url)
+        host, number = parts.hostname, parts.port
+    except ValueError:
+        host, number = None, None
+    if not url.startswith("rerun") or host is None or number is None:
+        allowed = "rerun+http://HOST:PORT/proxy"
+        raise InputError.of("this is no address of a viewer", path="--live-url", given=url, allowed=allowed)
+    if not _answers(host, number):
+        hint = "start 'rerun' there first, and check host, port and firewall"
+        raise InputError.of("no viewer answers there", path="--live-url", given=url, suggestion=hint)
+    return url
+
+
+def _start_viewer(command: list[str], port: int) -> None:
+    """Start a viewer that outlives this process, and wait until it answers."""
+    nothing = subprocess.DEVNULL
+    viewer = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
+    end = time.monotonic() + _START_S
+    while viewer.poll() is None and not _answers("127.0.0.1", port) and time.monotonic() < end:
+        time.sleep(0.1)
+    if viewer.poll() is None and time.monotonic() < end:
+        time.sleep(_OPENS_S)  # it may answer before it finds that there is no display
+        if viewer.poll() is None:
+            return
+    code = viewer.poll()
+    if code is None:
+        viewer.kill()
+        viewer.wait()
+    told = f"did not answer within {_START_S:g} s" if code is None else f"ended with exit code {code}"
+    hint = "on a machine without a display, start 'rerun' on another one and name it with --live-url"
+    raise InputError.of(f"the Rerun viewer {told}", path="--live", suggestion=hint)
+
+
+def _answers(host: str, port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection((host, port), timeout=_ANSWER_S):
+        return True
+    return False

@@ -44,6 +44,13 @@ def vehicle_record(
     )
 
 
+def still_vehicle(simulation: Simulation, number: int) -> VehicleRecord:
+    """One vehicle without a track: its name, kind and shape, to draw it."""
+    nothing = {"time_s": np.zeros(0), "position_m": np.zeros((0, 3)), "quaternion": np.zeros((0, 4))}
+    nothing |= {"velocity_m_s": np.zeros((0, 3)), "energy_j": np.zeros(0)}
+    return vehicle_record(simulation, number, nothing, np.full(len(events.KINDS), np.inf))
+
+
 def losses(vehicle: str, event_time_s: jax.Array | np.ndarray) -> list[Event]:
     """What ended the part of a vehicle in the mission, from its event times [kinds]."""
     return [

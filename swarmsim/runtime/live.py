@@ -147,11 +147,6 @@ class LiveMission:
                 rates |= {names[n]: float(v) for n, v in zip(np.asarray(group.member), values, strict=True)}
         return rates
 
-    def phase(self) -> str | None:
-        """Name of the phase that the vehicle is in."""
-        number = int(np.asarray(self._mission.phase_of[self.seat.group])[0, self.seat.local])
-        return None if number < 0 else self._simulation.plan.phases[number].name
-
     def path_m(self) -> np.ndarray | None:
         """The path [P, 3] of the phase that the vehicle is in, if that follows one."""
         number = int(np.asarray(self._mission.phase_of[self.seat.group])[0, self.seat.local])
