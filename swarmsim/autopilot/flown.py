@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from swarmsim.autopilot.compare import nearest, on_lines
 from swarmsim.autopilot.link import Identity, Setpoint, Telemetry
 
 TRACK, REPORT = "flown.parquet", "flown.json"
-ON_LINE_SHARE = 0.7  # of the greatest commanded speed: slower parts are corners, take-off and landing
 
 _NOTHING = (np.nan, np.nan, np.nan)
 
@@ -67,26 +67,12 @@ class FlownLog:
         rows = np.asarray(self.rows, np.float64)
         if not len(rows) or not self.paths:
             return np.zeros(0)
-        speed = np.hypot(rows[:, 5], rows[:, 6])
-        fast = (speed > ON_LINE_SHARE * np.nanmax(speed)) & np.isfinite(rows[:, 8])
+        fast = on_lines(np.hypot(rows[:, 5], rows[:, 6])) & np.isfinite(rows[:, 8])
         places = rows[fast, 8:10]
-        return np.min([_distances(places, path[:, :2]) for path in self.paths], axis=0) if len(places) else np.zeros(0)
+        return np.min([nearest(places, path)[0] for path in self.paths], axis=0) if len(places) else np.zeros(0)
 
 
 _COLUMNS = (("setpoint", "m"), ("setpoint_velocity", "m_s"), ("measured", "m"), ("measured_velocity", "m_s"))
-
-
-def _distances(places: np.ndarray, path: np.ndarray) -> np.ndarray:
-    """Least distances [n] of places [n, 2] from a polyline [P, 2]."""
-    a, d = path[:-1], np.diff(path, axis=0)
-    length2 = np.maximum(np.sum(d * d, axis=1), 1e-12)
-    best = np.full(len(places), np.inf)
-    for part in range(0, len(places), 256):
-        offset = places[part : part + 256, None] - a
-        share = np.clip(np.sum(offset * d, axis=2) / length2, 0.0, 1.0)
-        apart = offset - share[..., None] * d
-        best[part : part + 256] = np.sqrt(np.min(np.sum(apart * apart, axis=2), axis=1))
-    return best
 
 
 def report(

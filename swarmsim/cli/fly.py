@@ -39,8 +39,13 @@ def fly_mission(
     signing_key: Path | None,
     recover: str | None,
     dry_run: bool,
+    watch: bool = False,
+    watch_url: str | None = None,
 ) -> int:
-    """Fly a vehicle of the mission on a real autopilot, or tell what would be sent; the exit code."""
+    """Fly a vehicle of the mission on a real autopilot, or tell what would be sent; the exit code.
+
+    ``watch`` shows the flight in a viewer on this desktop, ``watch_url`` in one that runs there.
+    """
     from swarmsim.config.scenario import load_scenario
     from swarmsim.results.out_folder import check_out
 
@@ -61,7 +66,12 @@ def fly_mission(
         return _rehearsed(scenario, vehicle, console)
     folder = out if out is not None else Path("runs") / f"{scenario.mission.name}_{vehicle}"
     check_out(folder, force)
-    return _flown(scenario, vehicle, link, profile, system, signing_key, folder, force, console)
+    viewer = None
+    if watch or watch_url is not None:
+        from swarmsim.playback.viewer import live_address
+
+        viewer = live_address(watch_url)
+    return _flown(scenario, vehicle, link, profile, system, signing_key, folder, force, viewer, console)
 
 
 def _recovered(
@@ -146,7 +156,7 @@ def _rehearsed(scenario: "Scenario", vehicle: str, console: Console) -> int:
 
 def _flown(
     scenario: "Scenario", name: str, link: str, profile: str, system: int | None, key: Path | None, folder: Path,
-    force: bool, console: Console,
+    force: bool, viewer: str | None, console: Console,
 ) -> int:  # fmt: skip
     from swarmsim.atomic_folder import claimed
     from swarmsim.autopilot.control import refuse_under_way
@@ -154,6 +164,7 @@ def _flown(
     from swarmsim.autopilot.guard import outline_of
     from swarmsim.autopilot.link import LinkError
     from swarmsim.autopilot.opening import log_suffix, open_vehicle
+    from swarmsim.playback.live import LiveView
 
     simulation, live = _built(scenario, name)
     sys.setswitchinterval(SWITCH_S)
@@ -170,6 +181,7 @@ def _flown(
             return _failed(error)
         stopped: KeyboardInterrupt | None = None
         flight: Flight | None = None
+        view: LiveView | None = None
         code = EXIT_FLIGHT
         try:
             known = vehicle.identity
@@ -183,7 +195,10 @@ def _flown(
             refuse_under_way(vehicle)
             _prepared(live, console)
             outline = outline_of(simulation.site_model.site)
-            flight = Flight(vehicle, live, scenario.mission.autopilot, outline, flies, tell)
+            if viewer is not None:
+                view = LiveView(simulation, live, name, viewer)
+            observer = None if view is None else view.observe
+            flight = Flight(vehicle, live, scenario.mission.autopilot, outline, flies, tell, observer)
             vehicle.on_mode(flight.on_telemetry)
             # a collection of the garbage among all that was compiled would stop the stream for half a second
             gc.collect()
@@ -196,6 +211,8 @@ def _flown(
             gc.enable()
             gc.unfreeze()
             vehicle.close()
+            if view is not None:
+                view.close()
         if flight is not None and flight.log.rows:
             _write(simulation, live, flight, vehicle, name, folder, log, force, console)
     if stopped is not None:
@@ -224,6 +241,9 @@ def _write(
     log: Path, force: bool, console: Console,
 ) -> None:  # fmt: skip
     from swarmsim.autopilot import flown
+    from swarmsim.autopilot.flown_overlay import write_overlay
+    from swarmsim.autopilot.link import LinkError
+    from swarmsim.cli.replay_log import print_comparison
     from swarmsim.results.extract import mission_record
     from swarmsim.results.run_directory import write_run
     from swarmsim.runtime.run import timings_of
@@ -231,16 +251,27 @@ def _write(
     summary = flown.report(
         flight.log, flight.control.stream.gaps_s(), vehicle.identity, name, flight.control.takeover_s
     )
+    record = None
     try:
         with console.status("estimate and write"):
             batch = live.result()
             if batch.segments:
-                write_run(simulation, (mission_record(simulation, batch, 0),), folder, timings_of(batch), force=force)
+                record = mission_record(simulation, batch, 0)
+                write_run(simulation, (record,), folder, timings_of(batch), force=force)
     finally:  # what was flown stays, whatever becomes of the estimate
         folder.mkdir(parents=True, exist_ok=True)
         flown.write(folder, flight.log, summary)
         log.replace(folder / f"{LOG}{log.suffix}")
     _print_summary(summary, console.print)
+    if record is not None:
+        try:
+            with console.status("compare with the simulation"):
+                summary["comparison"] = write_overlay(folder, simulation, live, record, name, flight.log)
+        except LinkError as error:
+            console.print(f"not compared with the simulation: {escape(str(error))}", highlight=False)
+        else:
+            flown.write(folder, flight.log, summary)
+            print_comparison(summary["comparison"], console)
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
 
 

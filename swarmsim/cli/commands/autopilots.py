@@ -23,6 +23,8 @@ def fly(
     signing_key: Path | None = None,
     recover: Literal["land", "return"] | None = None,
     dry_run: bool = False,
+    live: bool = False,
+    live_url: str | None = None,
     force: bool = False,
 ) -> int:
     """Fly one vehicle of a mission on a real autopilot; the others are simulated around it.
@@ -34,6 +36,7 @@ def fly(
         swarmsim fly recon --vehicle uav1 --link ardrone:192.168.1.1
         swarmsim fly recon --vehicle uav1 --link pelican:/dev/ttyUSB0
         swarmsim fly recon --vehicle uav1 --recover land
+        swarmsim fly recon --vehicle uav1 --live
 
     How it flies (limits, watchdogs, what it does at the end) stands under 'autopilot' in the mission. Ctrl-C ends the
     flight as autopilot.at_end says. An operator who changes the mode takes over for good.
@@ -64,14 +67,19 @@ def fly(
         Fly no mission: have a vehicle that is under way land or return, and wait until it stands.
     dry_run
         Send nothing: print the setpoints that would be sent, as a table and on a map.
+    live
+        Show the flight in the Rerun viewer of this desktop, which is opened if need be.
+    live_url
+        Show it in a Rerun viewer that runs elsewhere: rerun+http://HOST:PORT/proxy.
     force
         Replace earlier results.
     """
     from swarmsim.cli.fly import fly_mission
 
     return fly_mission(
-        scenario, vehicle, link, profile, system, seed, overrides, out, force, signing_key, recover, dry_run
-    )
+        scenario, vehicle, link, profile, system, seed, overrides, out, force, signing_key, recover, dry_run, live,
+        live_url,
+    )  # fmt: skip
 
 
 @command(name="autopilot-sim")
