@@ -65,7 +65,7 @@ def _draw_above(axes: Axes, overlay: Overlay, site_model: SiteModel | None) -> N
         handles = handles or [*lines]
     if overlay.simulated is not None:
         x, y = _thin(overlay.simulated.track.position_m)[:, :2].T
-        handles += axes.plot(x, y, "-", color=SIMULATED, linewidth=1.1, label="simulated", zorder=4)
+        handles += axes.plot(x, y, "-", color=SIMULATED, linewidth=1.8, label="simulated", zorder=4)
     x, y = _thin(overlay.judged.position_m)[:, :2].T
     handles += axes.plot(x, y, "-", color=FLOWN, linewidth=0.8, label="flown", zorder=5)
     axes.plot(x[:1], y[:1], "s", color=FLOWN, markersize=3.0, markeredgecolor="black", markeredgewidth=0.4, zorder=6)
@@ -112,7 +112,7 @@ def _draw_heights(axes: Axes, overlay: Overlay) -> None:
     handles = []
     if track is not None:
         handles += axes.plot(
-            track.time_s, track.position_m[:, 2], "-", color=SIMULATED, linewidth=1.1, label="simulated"
+            track.time_s, track.position_m[:, 2], "-", color=SIMULATED, linewidth=1.8, label="simulated"
         )
     handles += axes.plot(overlay.flown.time_s, overlay.flown.position_m[:, 2], "-", color=FLOWN, linewidth=0.8,
                          label="flown")  # fmt: skip

@@ -114,6 +114,9 @@ class LiveView:
                 line = rr.SeriesLines(names=[vehicle.name], colors=[rgba(colour)], widths=[1.5])
                 stream.log(path_of(f"plots/{plot}", vehicle.name), line, static=True)
 
+        line = rr.SeriesLines(names=["horizontal"], colors=[rgba(_SETPOINT)], widths=[1.5])
+        stream.log("plots/error/from_setpoint", line, static=True)
+
     def _show(self, shown: _Shown) -> None:
         stream = self._stream
         stream.set_time(TIMELINE, duration=shown.time_s)

@@ -86,6 +86,12 @@ def test_a_vehicle_flies_its_part_of_the_mission(autopilot, vehicle, tmp_path, c
     assert (tmp_path / "out" / "flight.tlog").stat().st_size > 10_000
     assert (tmp_path / "out" / "summary.json").is_file()
     assert np.isfinite(track["measured_y_m"]).all()
+    compared = said["comparison"]
+    assert compared["whole"]["from_simulated_track"]["rms_m"] < 0.5
+    assert compared["whole"]["synchronised"]["rms_m"] < 2.0
+    assert abs(compared["time_shift_s"]) < 20.0
+    for name in ("simulated.parquet", "planned.parquet", "mission.rrd", "figures/flown.png"):
+        assert (tmp_path / "out" / name).is_file()
     capsys.readouterr()
 
 

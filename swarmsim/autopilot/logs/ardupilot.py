@@ -13,8 +13,26 @@ from swarmsim.config.errors import InputError
 _ESTIMATES = ("XKF1", "NKF1")  # of EKF3 and EKF2: position, velocity
 _PRIMARY = {"XKF1": "XKF4", "NKF1": "NKF4"}  # where the core that is flown by is told
 _ORIGIN_OF_ESTIMATE = 0  # ORGN.Type
-_NAMES = {"POS", "ATT", "MODE", "BAT", "MSG", "ORGN", "ARM", "PSCN", "PSCE", "PSCD", "PARM", "EV"}
-_NAMES |= {*_ESTIMATES, *_PRIMARY.values()}
+_MOTION = ("PN", "PE", "PD", "VN", "VE", "VD")
+_NUMBERS: dict[str, tuple[str, ...]] = {  # columns that a message must have to be used, beside TimeUS
+    "XKF1": _MOTION,
+    "NKF1": _MOTION,
+    "XKF4": ("PI",),
+    "NKF4": ("PI",),
+    "POS": ("Lat", "Lng", "Alt"),
+    "ORGN": ("Type", "Lat", "Lng", "Alt"),
+    "ATT": ("Roll", "Pitch", "Yaw"),
+    "MODE": ("Mode",),
+    "ARM": ("ArmState",),
+    "EV": ("Id",),
+    "BAT": ("RemPct",),
+    "PSCN": ("TPN",),
+    "PSCE": ("TPE",),
+    "PSCD": ("TPD",),
+    "PARM": ("Value",),
+    "MSG": (),
+}
+_TEXTS = {"PARM": ("Name",), "MSG": ("Message",)}
 _ARMED, _DISARMED = 10, 11  # EV.Id, older than the message ARM
 _TYPES = {"copter": mavlink.MAV_TYPE_QUADROTOR, "rover": mavlink.MAV_TYPE_GROUND_ROVER}
 _SYSTEM = ("SYSID_THISMAV", "MAV_SYSID")
@@ -22,7 +40,12 @@ _SYSTEM = ("SYSID_THISMAV", "MAV_SYSID")
 
 def read_dataflash(data: Data, system: int | None) -> FlightLog:
     """The flight in a log; raises `InputError` where it tells no position, or is not that of ``system``."""
-    messages, skipped = read_messages(data, _NAMES)
+    messages, skipped = read_messages(data, set(_NUMBERS))
+    messages = {
+        name: rows
+        for name, rows in messages.items()
+        if rows.has("TimeUS", *_NUMBERS[name]) and rows.has_texts(*_TEXTS.get(name, ()))
+    }
     if not messages:
         raise InputError.of("this is no dataflash log: no message could be read")
     notes = [f"{skipped} of {len(data)} bytes are no messages: skipped"] if skipped else []
@@ -64,7 +87,7 @@ def _system(messages: dict[str, Messages]) -> int | None:
 def _origin(messages: dict[str, Messages]) -> Geodetic | None:
     if "ORGN" not in messages:
         return None
-    told = messages["ORGN"].where(messages["ORGN"].rows["Type"] == _ORIGIN_OF_ESTIMATE)
+    told = messages["ORGN"].where(messages["ORGN"].numbers("Type") == _ORIGIN_OF_ESTIMATE)
     if not len(told):
         return None
     return Geodetic(*(float(told.numbers(name)[-1]) for name in ("Lat", "Lng", "Alt")))
@@ -73,13 +96,13 @@ def _origin(messages: dict[str, Messages]) -> Geodetic | None:
 def _track(messages: dict[str, Messages], notes: list[str]) -> Collected | None:
     origin = _origin(messages)
     for name in _ESTIMATES:
-        if name in messages and messages[name].has("PN", "PE", "PD", "VN", "VE", "VD", "TimeUS"):
+        if name in messages:
             rows = _of_primary(messages, name)
             position, velocity = (
                 np.stack([rows.numbers(f"{letter}{axis}") for axis in "NED"], axis=1) for letter in "PV"
             )
             return Collected(_seconds(rows), position, velocity, empty(4), origin=origin)
-    if "POS" not in messages or not messages["POS"].has("Lat", "Lng", "Alt", "TimeUS"):
+    if "POS" not in messages:
         return None
     rows = messages["POS"]
     places = np.stack([rows.numbers(name) for name in ("Lat", "Lng", "Alt")], axis=1)
@@ -94,8 +117,8 @@ def _of_primary(messages: dict[str, Messages], name: str) -> Messages:
     rows, told = messages[name], messages.get(_PRIMARY[name])
     if not rows.has("C"):
         return rows
-    if told is None or not told.has("PI", "TimeUS"):
-        return rows.where(rows.rows["C"] == rows.rows["C"][0])
+    if told is None:
+        return rows.where(rows.numbers("C") == rows.numbers("C")[0])
     last = np.maximum(np.searchsorted(_seconds(told), _seconds(rows), "right") - 1, 0)
     return rows.where(rows.numbers("C") == told.numbers("PI")[last])
 
@@ -108,21 +131,21 @@ def _with_the_rest(found: Collected, messages: dict[str, Messages], profile: Pro
         found.attitude = Series(_seconds(att), quaternion_of_euler(angles))
     if "MODE" in messages:
         modes = messages["MODE"]
-        numbers = modes.rows["ModeNum" if modes.has("ModeNum") else "Mode"].astype(int)
-        names = [f"mode {n}" if profile is None else profile.mode_of(int(n))[1] for n in numbers]
+        numbers = modes.numbers("ModeNum" if modes.has("ModeNum") else "Mode")
+        names = [f"mode {n:g}" if profile is None or not n >= 0 else profile.mode_of(int(n))[1] for n in numbers]
         found.modes = list(zip(_seconds(modes), names, strict=True))
     if "ARM" in messages:
         arm = messages["ARM"]
-        found.armed = list(zip(_seconds(arm), (arm.rows["ArmState"] == 1).tolist(), strict=True))
+        found.armed = list(zip(_seconds(arm), (arm.numbers("ArmState") == 1).tolist(), strict=True))
     if "EV" in messages:
-        events = messages["EV"].where(np.isin(messages["EV"].rows["Id"], (_ARMED, _DISARMED)))
-        more = zip(_seconds(events), (events.rows["Id"] == _ARMED).tolist(), strict=True)
+        events = messages["EV"].where(np.isin(messages["EV"].numbers("Id"), (_ARMED, _DISARMED)))
+        more = zip(_seconds(events), (events.numbers("Id") == _ARMED).tolist(), strict=True)
         found.armed = [*found.armed, *more]
     if "MSG" in messages:
         found.messages = list(zip(_seconds(messages["MSG"]), messages["MSG"].texts("Message"), strict=True))
-    if "BAT" in messages and messages["BAT"].has("RemPct"):
+    if "BAT" in messages:
         battery = messages["BAT"]
-        battery = battery.where(battery.rows["Inst"] == 0) if battery.has("Inst") else battery
+        battery = battery.where(battery.numbers("Inst") == 0) if battery.has("Inst") else battery
         found.battery = Series(_seconds(battery), battery.numbers("RemPct") / 100.0)
     found.setpoints_ned_m = _targets(messages)
     return found
@@ -130,11 +153,9 @@ def _with_the_rest(found: Collected, messages: dict[str, Messages], profile: Pro
 
 def _targets(messages: dict[str, Messages]) -> Series | None:
     """Targets of the position controller, which logs its three axes at the same times."""
-    axes = [messages.get(f"PSC{axis}") for axis in "NED"]
-    columns = [f"TP{axis}" for axis in "NED"]
-    if any(each is None or not each.has(name) for each, name in zip(axes, columns, strict=True)):
+    rows = [messages[f"PSC{axis}"] for axis in "NED" if f"PSC{axis}" in messages]
+    if len(rows) < 3:
         return None
-    rows = [each for each in axes if each is not None]
     count = min(map(len, rows))
-    values = np.stack([each.numbers(name)[:count] for each, name in zip(rows, columns, strict=True)], axis=1)
+    values = np.stack([each.numbers(f"TP{axis}")[:count] for each, axis in zip(rows, "NED", strict=True)], axis=1)
     return Series(_seconds(rows[0])[:count], values)

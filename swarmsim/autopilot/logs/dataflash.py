@@ -60,8 +60,18 @@ class Messages:
         return len(self.rows)
 
     def has(self, *names: str) -> bool:
-        """Whether it has all these columns."""
-        return set(names) <= set(self.factors)
+        """Whether it has all these columns, of numbers."""
+        return all(self._kind(name) in "iuf" for name in names)
+
+    def has_texts(self, *names: str) -> bool:
+        """Whether it has all these columns, of texts."""
+        return all(self._kind(name) == "S" for name in names)
+
+    def _kind(self, name: str) -> str:
+        """numpy's letter for the kind of a column; ``-`` where there is none, or each of its values is an array."""
+        fields = self.rows.dtype.fields
+        column = None if fields is None else fields.get(name)
+        return "-" if column is None or column[0].shape else column[0].kind
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column [n] in the unit of its format."""

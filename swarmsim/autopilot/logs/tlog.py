@@ -10,6 +10,7 @@ import mmap
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -253,7 +254,7 @@ def _collected(told: _Told, commanded: list[tuple[float, ...]], notes: list[str]
     """All times on the clock of reception, as the vehicle's own clock gives it."""
     clock = _rows([*told.clock], 2)
     own = np.zeros(len(clock))
-    for a, b in zip(told.starts, [*told.starts[1:], len(clock)], strict=True):
+    for a, b in pairwise([*told.starts, len(clock)]):
         own[a:b] = clock[a:b, 1] + np.median(clock[a:b, 0] - clock[a:b, 1])
     if len(told.starts) > 1:
         notes.append(f"the vehicle was switched on {len(told.starts)} times")
