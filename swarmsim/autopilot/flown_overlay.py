@@ -7,7 +7,7 @@ import numpy as np
 
 from swarmsim.autopilot.compare import Track, compare
 from swarmsim.autopilot.flown import FlownLog
-from swarmsim.autopilot.simulated import simulate, write_simulated
+from swarmsim.autopilot.simulated_track import simulate, write_simulated
 from swarmsim.playback.flown_figure import write_figure
 from swarmsim.playback.overlay import Overlay
 from swarmsim.playback.recording import write_recording

@@ -126,7 +126,7 @@ def _flown_vehicle(run: Path) -> str | None:
 def _mission(
     name: str, vehicle: str, seed: int | None, overrides: Sequence[str], run: Path | None, console: Console
 ) -> _Mission:
-    from swarmsim.autopilot.simulated import has_simulated, read_simulated, simulate_vehicle
+    from swarmsim.autopilot.simulated_track import has_simulated, read_simulated, simulate_vehicle
     from swarmsim.config.scenario import load_scenario
     from swarmsim.runtime.devices import use_all_cores
     from swarmsim.runtime.run import build

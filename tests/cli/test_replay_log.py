@@ -8,7 +8,7 @@ import pytest
 
 from swarmsim.autopilot.compare import Planned, Simulated, Track
 from swarmsim.autopilot.frames import geodetic_of_enu
-from swarmsim.autopilot.simulated import write_simulated
+from swarmsim.autopilot.simulated_track import write_simulated
 from swarmsim.cli.entry import main
 from swarmsim.config.scenario import load_scenario
 from swarmsim.playback.viewer import recording_of

@@ -1,4 +1,4 @@
-"""A project folder to spoil: shipped vehicles, sensors, nuclides and materials; missions, detectors and a site of the tests."""
+"""A project folder to spoil: shipped parts of every kind, and missions, detectors and a site of the tests."""
 
 import shutil
 from pathlib import Path

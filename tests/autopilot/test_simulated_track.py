@@ -10,7 +10,14 @@ from swarmsim.autopilot.compare import Planned, Simulated, Track
 from swarmsim.autopilot.flown import FlownLog
 from swarmsim.autopilot.flown_overlay import flown_track
 from swarmsim.autopilot.link import Setpoint, Telemetry
-from swarmsim.autopilot.simulated import PLANNED, SIMULATED, has_simulated, read_simulated, simulate, write_simulated
+from swarmsim.autopilot.simulated_track import (
+    PLANNED,
+    SIMULATED,
+    has_simulated,
+    read_simulated,
+    simulate,
+    write_simulated,
+)
 from swarmsim.config.errors import InputError
 from swarmsim.control.commands import PositionCommand
 
