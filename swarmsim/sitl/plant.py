@@ -1,7 +1,8 @@
 """The physics that firmware flies: some vehicles of a mission in one world, stepped by their actuators."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -9,19 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmsim import randomness
 from swarmsim.config.load import load_named
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.sensors import Place
 from swarmsim.control.commands import RotorSpeedCommand, WheelSpeedCommand
-from swarmsim.physics.rotations import rotation_matrix, to_body
-from swarmsim.sensors.suite import Readings, Suite, SuiteState, begin, read, suite_of
-from swarmsim.sensors.truth import Truth as SensorTruth
-from swarmsim.vehicles.state import GRAVITY_M_S2, RigidState
+from swarmsim.sensors.suite import Readings, sensors_of
 from swarmsim.world import events
 from swarmsim.world.build import grouped
 from swarmsim.world.kinds import KINDS
 from swarmsim.world.model import Group, World
+from swarmsim.world.sensing import Sensed as Sensing
+from swarmsim.world.sensing import Sensors, fit_sensors, sense, switch_on, truth_of
 from swarmsim.world.state import GroupState, WorldState
 from swarmsim.world.step import step
 
@@ -44,7 +43,7 @@ class Truth:
     angular_velocity_rad_s: Array  # [K, 3] body
     specific_force_m_s2: Array  # [K, 3] body: mean over the step, what an ideal accelerometer reads
     air_velocity_m_s: Array  # [K, 3] body: of the vehicle through the air
-    height_m: Array  # [K] of the lowest contact point above the ground
+    height_m: Array  # [K] of the centre of mass above the ground
     voltage_v: Array  # [K] of the battery; NaN of a rover
     charge: Array  # [K] share of the battery left
     intact: Bools  # [K] it has not crashed or collided
@@ -84,7 +83,7 @@ class Plant:
     def __init__(self, scenario: Scenario, place: Place, default: Sequence[str], seed: int = 0):
         """Build the world and compile its step; a step is a control period of ``scenario``.
 
-        ``place`` is where its origin lies; a vehicle that names no sensors has those of ``default``.
+        ``place`` is where its origin lies; ``default`` are sensors of the kinds that a vehicle does not name itself.
         """
         from swarmsim.runtime.clock import Clock
         from swarmsim.runtime.programs import Program
@@ -98,20 +97,12 @@ class Plant:
         world, start = simulation.world, simulation.reset(seed)
         groups = world.groups
         self.flies = np.repeat([bool(KINDS[g.kind].FLIES) for g in groups], [g.size for g in groups])[self._order]
-        suites = tuple(self._suite(scenario, k, place, default) for k in order)
-        keys = jax.random.split(randomness.consumer(start.key, "firmware sensors"), len(order))
-        sensed = tuple(map(begin, suites, keys))
-        fixed, begun = jax.device_put((world, suites)), jax.device_put((start, sensed))
+        sensors = fit_sensors(scenario, world, place=place, others=_with_default(scenario, default))
+        fixed, begun = jax.device_put((world, sensors)), jax.device_put((start, switch_on(sensors, start)))
         program = Program("firmware step", _stepped, clock=Clock())
         self._call, _ = program.executable(fixed, begun, self._given(np.zeros((len(order), ACTUATORS))))
         self._fixed, self._start = jax.tree.leaves(fixed), jax.tree.leaves(begun)
         self.reset()
-
-    def _suite(self, scenario: Scenario, number: int, place: Place, default: Sequence[str]) -> Suite:
-        vehicle = scenario.vehicles[number]
-        if vehicle.sensors:
-            return suite_of(vehicle, self.period_s, place=place, known=scenario.sensors)
-        return suite_of([load_named("sensors", name) for name in default], self.period_s, place=place)
 
     def reset(self) -> Truth:
         """Every vehicle at rest at its start again, a period after time zero."""
@@ -132,39 +123,37 @@ class Plant:
         return np.asarray(actuators, np.float32)[self._grouped]
 
 
-_Fixed = tuple[World, tuple[Suite, ...]]
-_Moving = tuple[WorldState, tuple[SuiteState, ...]]
+def _with_default(scenario: Scenario, default: Sequence[str]) -> dict[str, Sequence[str]]:
+    """Names of each vehicle's own sensors, and those of ``default`` of the kinds that it lacks."""
+    others = [load_named("sensors", name) for name in default]
+    names: dict[str, Sequence[str]] = {}
+    for member, vehicle in zip(scenario.members, scenario.vehicles, strict=True):
+        kinds = {sensor.kind for sensor in sensors_of(vehicle, scenario.sensors)}
+        names[member.name] = [*vehicle.sensors, *(s.name for s in others if s.kind not in kinds)]
+    return names
 
 
-def _stepped(fixed: _Fixed, moving: _Moving, actuators: jax.Array) -> tuple[_Moving, jax.Array]:
-    (world, suites), (before, sensed) = fixed, moving
+_Moving = tuple[WorldState, Sensing]
+
+
+def _stepped(fixed: tuple[World, Sensors], moving: _Moving, actuators: jax.Array) -> tuple[_Moving, jax.Array]:
+    (world, sensors), (before, sensing) = fixed, moving
     commands, first = [], 0
     for group in world.groups:
         commands.append(jax.vmap(_COMMANDS[group.kind])(group.params, actuators[first : first + group.size]))
         first += group.size
-    tick = before.clock.tick
     state, _ = step(world, before, commands, 1)
-    dt = world.timing.control_period_s
+    sensing, readings = sense(sensors, sensing, state)
     groups = zip(world.groups, before.groups, state.groups, strict=True)
-    rows = jnp.concatenate([_numbers(*both, dt) for both in groups])
-    keys = jax.random.split(randomness.consumer(before.key, "firmware sensors"), len(suites))
-    read_all = [
-        read(s, x, _sensor_truth(row), k, tick) for s, x, row, k in zip(suites, sensed, rows, keys, strict=True)
-    ]
-    told = jnp.stack([_row(readings) for _, readings in read_all])
-    return (state, tuple(x for x, _ in read_all)), jnp.concatenate([rows, told], axis=1)
+    truth = jnp.concatenate([_numbers(*both, world.timing.control_period_s) for both in groups])
+    return (state, sensing), jnp.concatenate([truth, _told(world, sensors, readings)], axis=1)
 
 
-def _sensor_truth(row: jax.Array) -> SensorTruth:
-    return SensorTruth(
-        position_m=row[0:3],
-        velocity_m_s=row[3:6],
-        quaternion=row[6:10],
-        angular_velocity_rad_s=row[10:13],
-        specific_force_m_s2=row[13:16],
-        air_velocity_m_s=row[16:19],
-        height_m=row[19],
-    )
+def _told(world: World, sensors: Sensors, readings: Sequence[Readings]) -> jax.Array:
+    """Readings [K, R] of all vehicles in the order of the groups."""
+    firsts = np.cumsum([0, *(group.size for group in world.groups)])
+    rows = np.concatenate([firsts[fitted.group] + np.array(fitted.local) for fitted in sensors.fitted])
+    return jnp.concatenate([jax.vmap(_row)(reading) for reading in readings])[np.argsort(rows)]
 
 
 _VECTORS = ("gyro_rad_s", "accel_m_s2", "gnss_position_m", "gnss_velocity_m_s", "magnetic_field_t")
@@ -205,27 +194,17 @@ _COMMANDS: dict[str, Callable[..., Any]] = {"multirotor": _rotors, "skid_steer":
 
 def _numbers(group: Group, before: GroupState, after: GroupState, dt: float) -> jax.Array:
     """States [U, 23] of a group's vehicles, in the order of `_truth`."""
-    flies = KINDS[group.kind].FLIES
-    voltage = after.vehicle.voltage_v if flies else jnp.full(group.size, jnp.nan)
-    body = after.vehicle.body
-
-    def one(old: RigidState, new: RigidState, wind_m_s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        turn = rotation_matrix(new.quaternion)
-        rise = jnp.array([0.0, 0.0, GRAVITY_M_S2])
-        return (
-            to_body(turn, (new.velocity_m_s - old.velocity_m_s) / dt + rise),
-            to_body(turn, new.velocity_m_s - wind_m_s),
-        )
-
-    force, air = jax.vmap(one)(before.vehicle.body, body, after.around.wind_m_s)
+    voltage = after.vehicle.voltage_v if KINDS[group.kind].FLIES else jnp.full(group.size, jnp.nan)
+    period_s = jnp.float32(dt)
+    t = jax.vmap(partial(truth_of, period_s))(before.vehicle.body, replace(after, counter=None))
     last = [
-        after.around.height_m,
+        t.height_m,
         voltage,
         1.0 - after.vehicle.energy_j / group.limits.battery_j,
         jax.vmap(events.intact)(after.event_time_s),
     ]
-    vectors = [body.position_m, body.velocity_m_s, body.quaternion, body.angular_velocity_rad_s, force, air]
-    return jnp.concatenate([*vectors, jnp.stack(last, axis=-1).astype(jnp.float32)], axis=-1)
+    vectors = [t.position_m, t.velocity_m_s, t.quaternion, t.angular_velocity_rad_s, t.specific_force_m_s2]
+    return jnp.concatenate([*vectors, t.air_velocity_m_s, jnp.stack(last, axis=-1).astype(jnp.float32)], axis=-1)
 
 
 def _truth(time_s: float, x: Array) -> Truth:

@@ -4,12 +4,10 @@ from typing import Literal
 
 from pydantic import Field
 
+from swarmsim.autopilot.settings import load_settings
 from swarmsim.config.autopilot import Origin
 from swarmsim.config.base import Delay, Duration, Model, Name
-from swarmsim.config.documents import read_file
 from swarmsim.config.errors import InputError
-from swarmsim.config.files import config_dirs, is_file
-from swarmsim.config.validation import validate
 
 KINDS = ("px4", "ardupilot")
 
@@ -63,9 +61,4 @@ def load_sitl_settings(kind: str) -> SitlSettings:
     """Settings of ``px4`` or ``ardupilot``, from the working folder's ``configs`` or the shipped ones."""
     if kind not in KINDS:
         raise InputError.of(f"there is no autopilot '{kind}'", given=kind, allowed=" or ".join(KINDS))
-    for folder in config_dirs():
-        file = folder / "autopilots" / f"sitl_{kind}.yaml"
-        if is_file(file):
-            settings: SitlSettings = validate(read_file(file), SitlSettings)
-            return settings
-    raise InputError.of(f"the settings of the firmware are missing: autopilots/sitl_{kind}.yaml")
+    return load_settings(f"sitl_{kind}", SitlSettings)
