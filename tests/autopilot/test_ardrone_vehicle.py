@@ -224,7 +224,7 @@ def test_the_peer_keeps_the_order_of_commands(drone):
     assert not drone._wants_air
 
 
-def test_the_peer_hovers_by_its_watchdog_until_it_is_reset(drone):
+def test_the_peer_hovers_by_its_watchdog_and_tells_so_until_it_is_reset(drone):
     stepped(drone, 4.0, ("COMWDG",), ("REF", at.REF_BASE | at.REF_START))
     forward = ("PCMD", 1, 0.0, -0.5, 0.0, 0.0)
     stepped(drone, 0.5, ("COMWDG",), forward)
@@ -233,9 +233,10 @@ def test_the_peer_hovers_by_its_watchdog_until_it_is_reset(drone):
     assert drone.control is Control.HOVERING
     assert drone.state() & State.COM_WATCHDOG
     stepped(drone, 0.2, forward)
-    assert drone.control is Control.HOVERING
-    stepped(drone, 0.2, ("COMWDG",), forward)
     assert drone.control is Control.FLYING
+    assert drone.state() & State.COM_WATCHDOG
+    stepped(drone, 0.2, ("COMWDG",), forward)
+    assert not drone.state() & State.COM_WATCHDOG
     stepped(drone, 2.1)
     assert drone.state() & State.COM_LOST
 

@@ -48,7 +48,11 @@ class ArdroneFaults:
 
 
 class ArdroneStandin(StickStandin):
-    """The drone; it listens at two UDP ports of ``host``."""
+    """The drone; it listens at two UDP ports of ``host``.
+
+    Without commands for ``watchdog_s`` it hovers until the next one; the bit of that watchdog stays until COMWDG. It
+    leaves the bootstrap mode when the CONFIG that asks for navdata is acknowledged.
+    """
 
     def __init__(
         self, body: Body, settings: ArdroneStandinSettings, host: str = "127.0.0.1",
@@ -220,7 +224,7 @@ class ArdroneStandin(StickStandin):
             if not self._wants_air:
                 self.control = Control.LANDING
             elif before is not Control.TAKING_OFF:
-                flies = self._sticks is not None and not self._watchdog
+                flies = self._sticks is not None and self.time_s - self._heard_s <= self.settings.watchdog_s
                 self.control = Control.FLYING if flies else Control.HOVERING
 
     # the navdata
