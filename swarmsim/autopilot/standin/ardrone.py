@@ -196,6 +196,8 @@ class ArdroneStandin(StickStandin):
         silent = self.time_s - self._heard_s
         self._watchdog = self._watchdog or silent > self.settings.watchdog_s
         self._lost = self._lost or silent > self.settings.lost_s
+        if silent > self.settings.watchdog_s:
+            self._sticks = None
         self._change(sensed)
         s, tilting = self.settings, self.tilting
         if self.emergency or self.control is Control.LANDED:
@@ -224,8 +226,7 @@ class ArdroneStandin(StickStandin):
             if not self._wants_air:
                 self.control = Control.LANDING
             elif before is not Control.TAKING_OFF:
-                flies = self._sticks is not None and self.time_s - self._heard_s <= self.settings.watchdog_s
-                self.control = Control.FLYING if flies else Control.HOVERING
+                self.control = Control.HOVERING if self._sticks is None else Control.FLYING
 
     # the navdata
 
