@@ -32,6 +32,8 @@ class ArdroneStandinSettings(StickSettings):
     watchdog_s: Duration
     lost_s: Duration
     hover_m: Length
+    take_off_m_s: Speed
+    land_m_s: Speed
     tilt_deg: Angle
     climb_m_s: Speed
     turn_deg_s: TurnRate

@@ -13,7 +13,7 @@ from swarmsim.autopilot.frames import yaw_of_quaternion
 from swarmsim.autopilot.outer_loop import GRAVITY_M_S2
 from swarmsim.autopilot.standin.body import Body, Motion, Sensed
 from swarmsim.autopilot.standin.settings import DefaultVehicle
-from swarmsim.config.base import Lag, Model, NonNegative, Speed
+from swarmsim.config.base import Lag, Model, NonNegative
 
 SINK_M_S = 0.5
 """Descent that is commanded on the ground: it keeps the motors off."""
@@ -33,8 +33,6 @@ class StickSettings(Model):
 
     step_s: float = Field(ge=0.005, le=0.1)
     default: DefaultVehicle
-    take_off_m_s: Speed
-    land_m_s: Speed
     tilting: TiltSettings
 
 
