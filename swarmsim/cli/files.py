@@ -95,7 +95,11 @@ def _check_autopilot(path: Path) -> str:
     from swarmsim.autopilot.standin.pelican import PelicanStandinSettings
     from swarmsim.autopilot.standin.settings import Settings
     from swarmsim.config.load import load_model
+    from swarmsim.sitl.settings import SitlSettings
 
+    if path.stem.startswith("sitl_"):
+        load_model(path, SitlSettings)
+        return "firmware in the loop"
     stand_in = path.stem.startswith("standin_")
     special = {
         "ardrone2": ArdroneSettings,
