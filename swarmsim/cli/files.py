@@ -21,7 +21,7 @@ from swarmsim.config.checks import sensors_twice
 from swarmsim.config.documents import read_file, shown_path
 from swarmsim.config.errors import InputError, Problem, file_errors_told, raise_if_any
 from swarmsim.config.load import load_all, load_named
-from swarmsim.config.names import one_of
+from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.sensors import SENSOR_KINDS
 
 _TOLD_BY_KIND = ("vehicles", "sensors")  # unions of models, which the field ``kind`` tells apart
@@ -82,8 +82,22 @@ def check_file(path: Path) -> tuple[str, list[str]]:
 
 def _check_sensors(vehicle: Any, path: Path) -> None:
     """Raise `InputError` where a vehicle names a sensor that there is not, or two of a kind."""
+    file, known = shown_path(path), files.available("sensors", path)
+    raise_if_any(
+        [
+            Problem(
+                f"there is no sensor '{name}'",
+                file=file,
+                path="sensors",
+                allowed=one_of(known),
+                suggestion=did_you_mean(name, known),
+            )
+            for name in vehicle.sensors
+            if name not in known
+        ]
+    )
     told = sensors_twice(vehicle, {name: load_named("sensors", name, path) for name in vehicle.sensors})
-    raise_if_any([Problem(sentence, file=shown_path(path), path="sensors") for sentence in told])
+    raise_if_any([Problem(sentence, file=file, path="sensors") for sentence in told])
 
 
 def _check_autopilot(path: Path) -> str:
