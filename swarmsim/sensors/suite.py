@@ -5,9 +5,11 @@
     state, readings = jax.jit(read)(suite, state, truth, key, tick)
 
 `begin` and `read` are pure: `jax.jit`, `jax.vmap` and `jax.lax.scan` work on them. The parameters are leaves, so that
-other values, of a sweep or of another part of the same kinds and rates, compile nothing anew. Call `read` inside of the program that steps the
-physics: a call by itself costs Python 0.4 ms for its hundred arrays, the sensors cost 3 us. Everything is float32: at
-10 km from the mission's origin a position is known to 1 mm, at 100 km to 8 mm, which is what an RTK fix is good for.
+other values, of a sweep or of another part of the same kinds and rates, compile nothing anew. Call `read` inside of the
+program that steps the physics: a call by itself costs Python 0.4 ms for its hundred arrays, the sensors cost 3 us.
+
+Everything is float32: at 10 km from the mission's origin a position is known to 1 mm, at 100 km to 8 mm, which is what
+an RTK fix is good for.
 """
 
 from collections.abc import Mapping, Sequence
