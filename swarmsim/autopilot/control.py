@@ -263,7 +263,11 @@ class Control:
             self._raise(Alarm(Action.HOLD, f"the mission gave no setpoint for {stale:g} s: this computer is too slow"))
 
     def _on_error(self, error: Exception) -> None:
-        self._raise(Alarm(Action.END, f"a setpoint could not be sent: {error}"))
+        self.failed(f"a setpoint could not be sent: {error}")
+
+    def failed(self, reason: str) -> None:
+        """Something of ours has failed: the vehicle's part ends; any thread may tell."""
+        self._raise(Alarm(Action.END, reason))
 
     def _raise(self, alarm: Alarm | None) -> None:
         """Remember the first alarm: they are latched."""

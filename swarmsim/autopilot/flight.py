@@ -17,6 +17,8 @@ from swarmsim.autopilot.flown import FlownLog
 from swarmsim.autopilot.frames import yaw_of_quaternion
 from swarmsim.autopilot.guard import Guard
 from swarmsim.autopilot.link import LinkError, Setpoint, Telemetry, VehicleLink
+from swarmsim.autopilot.manual.helm import Helm
+from swarmsim.autopilot.manual.sticks import Source
 from swarmsim.config.autopilot import Autopilot
 from swarmsim.runtime.live import LiveMission, LiveStep
 from swarmsim.vehicles.state import RigidState
@@ -38,15 +40,21 @@ class Flight:
 
     def __init__(
         self, link: VehicleLink, live: LiveMission, settings: Autopilot, outline_m: np.ndarray, flies: bool,
-        tell: Callable[[str], None], observer: Observer | None = None,
+        tell: Callable[[str], None], observer: Observer | None = None, pilot: Source | None = None,
     ):  # fmt: skip
-        """``live`` is prepared; ``outline_m`` [V, 2] bounds where positions may lie; ``tell`` prints a line."""
+        """``live`` is prepared; ``outline_m`` [V, 2] bounds where positions may lie; ``tell`` prints a line.
+
+        A ``pilot``'s device, open, lets him take the vehicle over and hand it back.
+        """
         self.link, self.live, self.settings, self.flies = link, live, settings, flies
         self._tell, self._observer = tell, observer
         rest = live.body()
         self._rest = tuple(float(v) for v in rest.position_m)
         guard = Guard(limits=settings.limits, outline_m=outline_m, ground_m=self._rest[2], flies=flies)
         self.control = Control(link, settings, guard, flies, self._stage)
+        self.helm = (
+            None if pilot is None else Helm(pilot, self.control, guard, settings, live.speed_max_m_s, self._stage)
+        )
         self.log = FlownLog()
         self._wanted = False  # a phase asks for the vehicle, which does not follow us yet
         self._waits = False  # it holds until its next phase
@@ -65,6 +73,8 @@ class Flight:
         self.link.align(self._rest)  # type: ignore[arg-type]
         self.live.start()
         self.control.stream.start()
+        if self.helm is not None:
+            self.helm.start()
         try:
             self._mission()
         except KeyboardInterrupt:
@@ -75,6 +85,8 @@ class Flight:
             self.control.emergency()
             raise
         finally:
+            if self.helm is not None:
+                self.helm.close()
             self.control.stream.close()
             if self.control.alarm is not None:  # the first cause, not what came of it
                 self.log.ended = self.control.alarm.reason
@@ -110,7 +122,7 @@ class Flight:
                 due = time.monotonic()
             self._leave_if_over()
             stands = control.stands()
-            if step.over or (stands and self._left and live.over_without_vehicle()):
+            if (step.over and not self._by_hand) or (stands and self._left and live.over_without_vehicle()):
                 break
             due = max(due + live.period_s, time.monotonic() - live.period_s)
             time.sleep(max(0.0, due - time.monotonic()))
@@ -122,7 +134,7 @@ class Flight:
 
     def _plan(self, step: LiveStep) -> None:
         """Begin phases, which may take seconds: the vehicle holds meanwhile."""
-        if self.control.state is State.FOLLOWS:
+        if self.control.state is State.FOLLOWS and not self._by_hand:
             self.control.hold()
         self.log.event("plan " + ", ".join(step.begins))
         self._begin()
@@ -148,6 +160,8 @@ class Flight:
     def _command(self, step: LiveStep, t: Telemetry) -> Setpoint | None:
         """Offer the policy's setpoint, or end the vehicle's part where the mission is done with it."""
         control = self.control
+        if self._flown_by_hand(step, t):
+            return None if self.helm is None else self.helm.setpoint
         if not step.in_phase:
             if not self._waits:
                 self._waits = True
@@ -157,13 +171,41 @@ class Flight:
             return None
         self._waits = False
         setpoint = setpoint_of(step.command)
-        self.log.row(step.time_s, setpoint, t, self.live.path_m)
         if self._descends(setpoint, t):
             self._landed_in = self.live.phase()
             control.end("land")
             return None
-        control.offer(setpoint)
-        return setpoint
+        offered: Setpoint | None = setpoint
+        if self.helm is None:
+            control.offer(setpoint)
+        else:
+            offered = self.helm.offer(setpoint)
+        if offered is not None:
+            self.log.row(step.time_s, offered, t, self.live.path_m, by_hand=offered is not setpoint)
+        return offered
+
+    @property
+    def _by_hand(self) -> bool:
+        """Whether a pilot flies."""
+        return self.helm is not None and self.helm.flies and self.control.state is State.FOLLOWS
+
+    def _flown_by_hand(self, step: LiveStep, t: Telemetry) -> bool:
+        """Do what the pilot asks for; whether the vehicle is none of the policy's in this step."""
+        if self.helm is None:
+            return False
+        wish, flown_m = self.helm.wish(), self.helm.handed_back()
+        if wish is not None:
+            self.log.ended = f"{wish.value}: the pilot asked for it"
+            self._landed_in = self.live.phase()
+            self.control.end(wish.value)
+            return True
+        if flown_m is not None:
+            self.live.join(self._body(t), flown_m)
+            self.helm.resume()
+            self._stage("mission")
+        elif self.helm.flies and self.helm.setpoint is not None:
+            self.log.row(step.time_s, self.helm.setpoint, t, self.live.path_m, by_hand=True)
+        return self.helm.flies
 
     def _descends(self, s: Setpoint, t: Telemetry) -> bool:
         """Whether the mission brings it down where autopilots land by themselves."""
@@ -180,6 +222,8 @@ class Flight:
             self._left = True
         elif self.control.state is not State.FOLLOWS and not self._wanted and not self.live.has_phase_to_come():
             self._left = True
+        if self.helm is not None:
+            self.helm.over = self._left
 
     def _body(self, t: Telemetry) -> RigidState:
         """The vehicle's body in the mission. One that stands is on the ground, whatever its receiver says."""

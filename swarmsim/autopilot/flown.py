@@ -25,6 +25,7 @@ class FlownLog:
 
     rows: list[tuple[float, ...]] = field(default_factory=list)
     modes: list[str] = field(default_factory=list)
+    by_hand: list[bool] = field(default_factory=list)  # of each row: a pilot flew, or it was on its way back
     events: list[tuple[float, str]] = field(default_factory=list)
     ended: str = ""  # why the vehicle's part ended before its time; empty if it did not
     paths: list[np.ndarray] = field(default_factory=list)
@@ -35,13 +36,16 @@ class FlownLog:
         """Something happened now."""
         self.events.append((time.monotonic() - self._start, text))
 
-    def row(self, time_s: float, s: Setpoint, t: Telemetry, path_m: Callable[[], np.ndarray | None]) -> None:
+    def row(
+        self, time_s: float, s: Setpoint, t: Telemetry, path_m: Callable[[], np.ndarray | None], by_hand: bool = False
+    ) -> None:
         """What was asked for and measured at the mission's time ``time_s``."""
         if not self.rows or time_s - self.rows[-1][0] > 1.0 or len(self.rows) % 100 == 0:
             path = path_m()
             if path is not None and not any(np.array_equal(path, known) for known in self.paths):
                 self.paths.append(path)
         self.modes.append(t.mode_name)
+        self.by_hand.append(by_hand)
         self.rows.append(
             (
                 time_s,
@@ -55,16 +59,22 @@ class FlownLog:
         )
 
     def table(self) -> pa.Table:
-        """One row for each judging period: time s, positions m and velocities m/s (world ENU), mode, battery."""
+        """One row for each judging period: time s, positions m and velocities m/s (world ENU), mode, battery.
+
+        ``by_hand``: a pilot flew, or it was on its way back. Setpoints of a rover are in its body frame.
+        """
         names = ["time_s", "wall_s"]
         names += [f"{what}_{axis}_{unit}" for what, unit in _COLUMNS for axis in "xyz"]
         columns = np.asarray(self.rows, np.float64).reshape(-1, len(names) + 1).T
         table = dict(zip([*names, "battery"], columns, strict=True))
-        return pa.table({**table, "mode": pa.array(self.modes, pa.string())})
+        return pa.table(
+            {**table, "mode": pa.array(self.modes, pa.string()), "by_hand": pa.array(self.by_hand, pa.bool_())}
+        )
 
     def cross_track_m(self) -> np.ndarray:
         """Horizontal distances [n] from the planned path, where the vehicle was to fly at nearly full speed."""
         rows = np.asarray(self.rows, np.float64)
+        rows = rows[~np.asarray(self.by_hand, bool)]
         if not len(rows) or not self.paths:
             return np.zeros(0)
         fast = on_lines(np.hypot(rows[:, 5], rows[:, 6])) & np.isfinite(rows[:, 8])

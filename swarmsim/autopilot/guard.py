@@ -1,6 +1,7 @@
 """What is asked of every setpoint before any byte of it is sent."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,6 +11,8 @@ from swarmsim.config.autopilot import SetpointLimits
 from swarmsim.site.model import Site, bounds_m
 
 ROUNDING = 1.001  # a command at a limit may exceed it by float32's rounding
+
+ROUNDS, INSIDE_M = 32, 1e-3  # of the search for the nearest place inside, and how far inside it then is
 
 
 class RefusedError(ValueError):
@@ -53,6 +56,20 @@ class Guard:
         """The next position may lie anywhere in the volume: the vehicle has been elsewhere meanwhile."""
         self._last = None
 
+    def nearest(self, place_m: Vector) -> Vector | None:
+        """Where positions may lie, near a finite place that may be outside; None if the volume is empty."""
+        normals, limits = inward_normals(self.outline_m), self.limits
+        level = np.array(place_m[:2], np.float64)
+        for _ in range(ROUNDS):
+            short = limits.margin_m + INSIDE_M - inward_distances(self.outline_m, normals, level)
+            worst = int(np.argmax(short))
+            if short[worst] <= 0.5 * INSIDE_M:
+                low, high = self.ground_m - limits.floor_m, self.ground_m + limits.ceiling_m
+                height = min(high - INSIDE_M, max(low + INSIDE_M, place_m[2])) if self.flies else place_m[2]
+                return float(level[0]), float(level[1]), height
+            level = level + short[worst] * normals[worst]
+        return None
+
     def _shape(self, s: Setpoint) -> None:
         if s.position_m is None and s.velocity_m_s is None:
             raise RefusedError("it has neither a position nor a velocity")
@@ -88,10 +105,7 @@ class Guard:
 
     def _volume(self, place: Vector) -> None:
         x, y, z = place
-        corners = np.asarray(self.outline_m, np.float64)
-        edges = np.roll(corners, -1, axis=0) - corners
-        inward = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
-        inside = np.min(np.sum((np.array([x, y]) - corners) * inward, axis=1))
+        inside = np.min(inward_distances(self.outline_m, inward_normals(self.outline_m), place))
         if inside < self.limits.margin_m:
             where = f"{-inside:.1f} m outside" if inside < 0 else f"{inside:.1f} m inside"
             raise RefusedError(
@@ -117,3 +131,18 @@ class Guard:
                 f"its position jumps by {apart:.1f} m in {now_s - then_s:.2f} s: {allowed:.1f} m are allowed "
                 "(limits.jump_m and the greatest speed)"
             )
+
+
+def inward_normals(outline_m: np.ndarray) -> np.ndarray:
+    """Unit normals [V, 2] of the edges of a convex, counter-clockwise outline [V, 2], towards its inside."""
+    corners = np.asarray(outline_m, np.float64)
+    edges = np.roll(corners, -1, axis=0) - corners
+    normals: np.ndarray = np.stack([-edges[:, 1], edges[:, 0]], axis=1) / np.linalg.norm(edges, axis=1)[:, None]
+    return normals
+
+
+def inward_distances(outline_m: np.ndarray, normals: np.ndarray, place_m: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Distances [V] of a place (x, y, …) inside of each edge of an outline; negative outside."""
+    apart = np.asarray(place_m, np.float64)[:2] - np.asarray(outline_m, np.float64)
+    distances: np.ndarray = np.sum(apart * normals, axis=1)
+    return distances

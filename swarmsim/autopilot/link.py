@@ -70,11 +70,12 @@ class Telemetry:
 class Identity:
     """Which vehicle a link talks to."""
 
-    autopilot: str  # px4 | ardupilot | ardrone2 | pelican
+    autopilot: str  # px4 | ardupilot | ardrone2 | pelican | sim
     vehicle: str  # copter | rover
     system: int
     component: int
     version: str = "unknown"
+    reverses: bool = True  # a rover: whether it can be driven backwards
 
 
 class VehicleLink(Protocol):

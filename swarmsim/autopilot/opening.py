@@ -8,11 +8,12 @@ from swarmsim.autopilot.link import VehicleLink
 from swarmsim.autopilot.mavlink.transport import ALLOWED as MAVLINK
 from swarmsim.autopilot.mavlink.transport import parse_link
 from swarmsim.config.errors import InputError
+from swarmsim.config.scenario import Scenario
 
-ARDRONE, PELICAN = "ardrone", "pelican"
-PROFILES = {ARDRONE: "ardrone2", PELICAN: "pelican"}
+ARDRONE, PELICAN, SIMULATED = "ardrone", "pelican", "sim"
+PROFILES = {ARDRONE: "ardrone2", PELICAN: "pelican", SIMULATED: "sim"}
 """Profiles of the links that are not MAVLink; each kind of link has one."""
-ALLOWED = "ardrone:HOST[:COMMANDS:NAVDATA] (UDP ports), pelican:DEVICE[:BAUD]"
+ALLOWED = "ardrone:HOST[:COMMANDS:NAVDATA] (UDP ports), pelican:DEVICE[:BAUD], sim: (simulated in this process)"
 BAUD = 57_600
 _BAUD_MAX, _PORT_MAX = 10_000_000, 65_535
 
@@ -34,8 +35,13 @@ class PelicanAddress:
     baud: int = BAUD
 
 
+@dataclass(frozen=True)
+class SimulatedAddress:
+    """A vehicle that is simulated in this process."""
+
+
 def kind_of(link: str) -> str:
-    """``ardrone``, ``pelican``, or ``mavlink`` for everything else."""
+    """``ardrone``, ``pelican``, ``sim``, or ``mavlink`` for everything else."""
     kind = link.strip().partition(":")[0]
     return kind if kind in PROFILES else "mavlink"
 
@@ -45,7 +51,7 @@ def log_suffix(link: str) -> str:
     return ".tlog" if kind_of(link) == "mavlink" else ".log"
 
 
-def parse(link: str) -> ArdroneAddress | PelicanAddress | str:
+def parse(link: str) -> ArdroneAddress | PelicanAddress | SimulatedAddress | str:
     """What a link string means; a MAVLink link as it is. Raises `InputError` with all allowed forms."""
     kind, text = kind_of(link), link.strip()
     rest = text.partition(":")[2]
@@ -54,6 +60,9 @@ def parse(link: str) -> ArdroneAddress | PelicanAddress | str:
         device, number = (device, _number(baud, _BAUD_MAX)) if colon else (rest, BAUD)
         if device and number is not None:
             return PelicanAddress(device, number)
+    elif kind == SIMULATED:
+        if not rest and text.endswith(":"):
+            return SimulatedAddress()
     elif kind == ARDRONE:
         host, *ports = rest.split(":")
         numbers = [_number(port, _PORT_MAX) for port in ports]
@@ -75,12 +84,14 @@ def _number(text: str, most: int) -> int | None:
 def open_vehicle(
     link: str, *, profile: str = "auto", system: int | None = None, log: Path | None = None,
     key_file: Path | None = None, dry: bool = False, timeout_s: float = 10.0,
+    simulated: tuple[Scenario, str] | None = None,
 ) -> VehicleLink:  # fmt: skip
     """Open ``link`` and find the vehicle there.
 
     ``profile`` is px4 or ardupilot for MAVLink, ardrone2, pelican, or auto; ``system`` (its system id) and ``key_file``
     (the signing key) are of MAVLink alone. ``log`` is the file that everything sent and received is written to, named
-    with `log_suffix`. With ``dry`` nothing is sent that moves the vehicle. Raises `InputError` for what cannot be
+    with `log_suffix`; a simulated vehicle has none. ``simulated`` is the mission and the name of the vehicle that
+    ``sim:`` simulates. With ``dry`` nothing is sent that moves the vehicle. Raises `InputError` for what cannot be
     meant, `LinkError` when no such vehicle is heard within ``timeout_s``.
     """
     address = parse(link)
@@ -98,9 +109,21 @@ def open_vehicle(
     for name, value in (("--system", system), ("--signing-key", key_file)):
         if value is not None:
             raise InputError.of(f"{name} is of MAVLink links alone", path=name, given=str(value))
+    if isinstance(address, SimulatedAddress):
+        return _simulated(simulated)
     if isinstance(address, ArdroneAddress):
         return _ardrone(address, log, dry, timeout_s)
     return _pelican(address, log, dry, timeout_s)
+
+
+def _simulated(of: tuple[Scenario, str] | None) -> VehicleLink:
+    if of is None:
+        raise InputError.of(
+            "a simulated vehicle is as old as its flight: there is none to be found", path="--link", given="sim:"
+        )
+    from swarmsim.autopilot.simulated import simulated_vehicle
+
+    return simulated_vehicle(*of, of[0].mission.seed)
 
 
 def _other_profile(link: str, profile: str, allowed: str) -> InputError:

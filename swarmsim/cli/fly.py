@@ -3,6 +3,7 @@
 import gc
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,8 @@ from swarmsim.config.errors import InputError
 if TYPE_CHECKING:
     from swarmsim.autopilot.guard import Guard
     from swarmsim.autopilot.link import VehicleLink
+    from swarmsim.autopilot.manual.status import StatusLine
+    from swarmsim.autopilot.manual.sticks import Source
     from swarmsim.config.scenario import Scenario
     from swarmsim.runtime.live import LiveMission
     from swarmsim.runtime.simulation import Simulation
@@ -41,10 +44,12 @@ def fly_mission(
     dry_run: bool,
     watch: bool = False,
     watch_url: str | None = None,
+    manual: str | None = None,
 ) -> int:
-    """Fly a vehicle of the mission on a real autopilot, or tell what would be sent; the exit code.
+    """Fly a vehicle of the mission on a real or a simulated autopilot, or tell what would be sent; the exit code.
 
-    ``watch`` shows the flight in a viewer on this desktop, ``watch_url`` in one that runs there.
+    ``watch`` shows the flight in a viewer on this desktop, ``watch_url`` in one that runs there; a pilot may take the
+    vehicle over with ``manual``.
     """
     from swarmsim.config.scenario import load_scenario
     from swarmsim.results.out_folder import check_out
@@ -59,6 +64,8 @@ def fly_mission(
         from swarmsim.autopilot.opening import parse
 
         parse(link)  # a wrong one is told before anything is compiled
+    if manual is not None and (dry_run or recover is not None):
+        raise InputError.of("nobody flies in a dry run or to recover a vehicle: leave out --manual", path="--manual")
     console = Console()
     if recover is not None:
         return _recovered(link, profile, system, signing_key, recover, scenario, console)
@@ -71,7 +78,22 @@ def fly_mission(
         from swarmsim.playback.viewer import live_address
 
         viewer = live_address(watch_url)
-    return _flown(scenario, vehicle, link, profile, system, signing_key, folder, force, viewer, console)
+    with _device(manual, scenario) as pilot:
+        return _flown(scenario, vehicle, link, profile, system, signing_key, folder, force, viewer, console, pilot)
+
+
+def _device(manual: str | None, scenario: "Scenario") -> "AbstractContextManager[Source | None]":
+    """What the pilot flies with: the keyboard, a gamepad, or nothing."""
+    from swarmsim.autopilot.manual.gamepad import Gamepad
+    from swarmsim.autopilot.manual.keyboard import Keyboard
+
+    if manual is None:
+        return nullcontext()
+    kinds: dict[str, Callable[[Any], AbstractContextManager[Source | None]]] = {
+        "keyboard": Keyboard,
+        "gamepad": Gamepad,
+    }
+    return kinds[manual](scenario.mission.autopilot.manual)
 
 
 def _recovered(
@@ -156,13 +178,14 @@ def _rehearsed(scenario: "Scenario", vehicle: str, console: Console) -> int:
 
 def _flown(
     scenario: "Scenario", name: str, link: str, profile: str, system: int | None, key: Path | None, folder: Path,
-    force: bool, viewer: str | None, console: Console,
+    force: bool, viewer: str | None, console: Console, pilot: "Source | None",
 ) -> int:  # fmt: skip
     from swarmsim.atomic_folder import claimed
     from swarmsim.autopilot.control import refuse_under_way
     from swarmsim.autopilot.flight import Flight
     from swarmsim.autopilot.guard import outline_of
     from swarmsim.autopilot.link import LinkError
+    from swarmsim.autopilot.manual.status import StatusLine
     from swarmsim.autopilot.opening import log_suffix, open_vehicle
     from swarmsim.playback.live import LiveView
 
@@ -171,21 +194,21 @@ def _flown(
     folder.parent.mkdir(parents=True, exist_ok=True)
     log = folder.parent / f"{folder.name}{log_suffix(link)}"  # whatever happens, what was said stays
 
-    def tell(text: str) -> None:
-        console.print(escape(text), highlight=False)
-
+    flight: Flight | None = None
+    screen = StatusLine(sys.stdout, lambda: "" if flight is None or flight.helm is None else flight.helm.line())
     with claimed(folder):
         try:
-            vehicle = open_vehicle(link, profile=profile, system=system, log=log, key_file=key)
+            vehicle = open_vehicle(
+                link, profile=profile, system=system, log=log, key_file=key, simulated=(scenario, name)
+            )
         except LinkError as error:
             return _failed(error)
         stopped: KeyboardInterrupt | None = None
-        flight: Flight | None = None
         view: LiveView | None = None
         code = EXIT_FLIGHT
         try:
             known = vehicle.identity
-            tell(f"{known.autopilot} {known.vehicle} {known.version}, system {known.system}")
+            screen.tell(f"{known.autopilot} {known.vehicle} {known.version}, system {known.system}")
             flies = _flies(live)
             if (known.vehicle == "rover") == flies:
                 raise InputError.of(
@@ -198,13 +221,13 @@ def _flown(
             if viewer is not None:
                 view = LiveView(simulation, live, name, viewer)
             observer = None if view is None else view.observe
-            flight = Flight(vehicle, live, scenario.mission.autopilot, outline, flies, tell, observer)
+            flight = Flight(vehicle, live, scenario.mission.autopilot, outline, flies, screen.tell, observer, pilot)
             vehicle.on_mode(flight.on_telemetry)
             # a collection of the garbage among all that was compiled would stop the stream for half a second
             gc.collect()
             gc.freeze()
             gc.disable()
-            code, stopped = _outcome(flight)
+            code, stopped = _outcome(flight, screen)
         except LinkError as error:
             _failed(error)
         finally:
@@ -220,12 +243,13 @@ def _flown(
     return code
 
 
-def _outcome(flight: Any) -> tuple[int, KeyboardInterrupt | None]:
+def _outcome(flight: Any, screen: "StatusLine") -> tuple[int, KeyboardInterrupt | None]:
     """The exit code of a flight, and what stopped it."""
     from swarmsim.autopilot.link import LinkError
 
     try:
-        flight.fly()
+        with screen:
+            flight.fly()
     except LinkError as error:
         flight.log.event(str(error))
         flight.log.ended = flight.log.ended or str(error)
@@ -233,7 +257,7 @@ def _outcome(flight: Any) -> tuple[int, KeyboardInterrupt | None]:
     except KeyboardInterrupt as stop:
         flight.log.ended = flight.log.ended or "stopped by the user"
         return 0, stop
-    return EXIT_FLIGHT if flight.log.ended else 0, None
+    return EXIT_FLIGHT if flight.control.alarm is not None else 0, None
 
 
 def _write(
@@ -261,7 +285,8 @@ def _write(
     finally:  # what was flown stays, whatever becomes of the estimate
         folder.mkdir(parents=True, exist_ok=True)
         flown.write(folder, flight.log, summary)
-        log.replace(folder / f"{LOG}{log.suffix}")
+        if log.exists():  # a simulated vehicle has none
+            log.replace(folder / f"{LOG}{log.suffix}")
     _print_summary(summary, console.print)
     if record is not None:
         try:

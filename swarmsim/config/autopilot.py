@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from swarmsim.config.base import Acceleration, Delay, Duration, Fraction, Gap, Model, Speed
+from swarmsim.config.manual import Manual
 
 
 class Origin(Model):
@@ -67,6 +68,7 @@ class Autopilot(Model):
     land_s: Duration = 120.0
     limits: SetpointLimits = SetpointLimits()
     watchdogs: Watchdogs = Watchdogs()
+    manual: Manual = Manual()
 
     @model_validator(mode="after")
     def _stream_is_not_stale(self) -> "Autopilot":

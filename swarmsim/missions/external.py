@@ -143,7 +143,7 @@ def _driven(params: Any, vehicle: Any, command: SkidSteerCommand) -> SkidSteerCo
 def joined(plan: Plan, mission: MissionState, seat: Seat, here: jax.Array, within_m: jax.Array) -> MissionState:
     """The mission with the vehicle's references where its paths pass ``here`` [3]: it took off by other means.
 
-    Looked for along the first ``within_m`` [] of each path.
+    Looked for along the next ``within_m`` [] of each path: what it has flown of it already stays flown.
     """
     phases = list(mission.phases)
     for number, phase in enumerate(plan.phases):
@@ -151,13 +151,13 @@ def joined(plan: Plan, mission: MissionState, seat: Seat, here: jax.Array, withi
         if rank is None or state.path is None or not isinstance(state.memory, Progress):
             continue
         path = jax.tree.map(lambda x, rank=rank: x[rank], state.path)
-        progress = state.memory.progress_m.at[rank].max(_nearest(path, here, within_m))
+        progress = state.memory.progress_m.at[rank].set(_nearest(path, state.memory.progress_m[rank], here, within_m))
         phases[number] = replace(state, memory=replace(state.memory, progress_m=progress))
     return replace(mission, phases=tuple(phases))
 
 
-def _nearest(path: Path, place_m: jax.Array, within_m: jax.Array) -> jax.Array:
-    arc = jnp.linspace(0.0, 1.0, JOINED_AT) * jnp.minimum(within_m, path.length_m)
+def _nearest(path: Path, from_m: jax.Array, place_m: jax.Array, within_m: jax.Array) -> jax.Array:
+    arc = from_m + jnp.linspace(0.0, 1.0, JOINED_AT) * jnp.clip(path.length_m - from_m, 0.0, within_m)
     apart = jax.vmap(lambda s: reference(path, s).position_m)(arc) - place_m
     return arc[jnp.argmin(jnp.sum(apart * apart, axis=1))]
 

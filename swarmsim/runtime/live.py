@@ -49,6 +49,7 @@ class LiveMission:
         group = next(k for k, members in enumerate(groups) if number in members)
         self.seat = Seat(group=group, local=groups[group].index(number))
         self.kind = simulation.world.groups[group].kind
+        self.speed_max_m_s = float(simulation.scenario.vehicles[number].control.speed_max_m_s)
         self._draws, self._batch, worlds, plans = simulation.alone(seed)
         self._inputs = (worlds, plans)
         self._run = MissionRun(self._batch, worlds, plans, simulation.plan, self._tell)
@@ -184,7 +185,7 @@ class LiveMission:
         )
 
     def join(self, body: RigidState, within_m: float) -> None:
-        """Let the vehicle's references go on from where its paths pass ``body``, within that length of their begin."""
+        """Let the vehicle's references go on from where its paths pass ``body``, within that length from now."""
         self._mission = self._batch.run(
             self._of_seat("live join"), partial(_join, self.seat.group, self.seat.local), self._inputs, self._mission,
             (np.asarray(body.position_m, np.float32), np.float32(within_m), np.int32(self._tick)), donate=True,

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -85,7 +86,8 @@ class MavlinkVehicle:
             self._profile = detect_profile(found.autopilot, found.vehicle_type, autopilot, vehicle)
             self.streams_first = self._profile.kind.command.stream_first_s > 0.0
             target = (found.system, found.component)
-            self.identity = Identity(self._profile.autopilot.name, self._profile.vehicle, *target)
+            reverses = self._profile.kind.setpoints.reverse
+            self.identity = Identity(self._profile.autopilot.name, self._profile.vehicle, *target, reverses=reverses)
             self._commands = Commands(self._transmit, target, own, self._profile.autopilot.integer_parameters)
             self._rates = Rates(self._profile.autopilot, self._commands)
             self._connection.select(*target)
@@ -267,9 +269,7 @@ class MavlinkVehicle:
                 lambda heard: heard.version is not None and heard.heard_s is not None, time.monotonic() + 0.6
             ):
                 break
-        known = self.identity
-        version = self._heard.version or known.version
-        self.identity = Identity(known.autopilot, known.vehicle, known.system, known.component, version)
+        self.identity = replace(self.identity, version=self._heard.version or self.identity.version)
 
     def _enter(self, mode: Mode, timeout_s: float) -> None:
         name, custom, numbers = self._profile.command_of(mode)

@@ -7,7 +7,7 @@ import numpy as np
 
 from swarmsim.autopilot.frames import yaw_of_quaternion
 from swarmsim.autopilot.standin.body import Array, Motion, Sensed
-from swarmsim.autopilot.standin.settings import Settings
+from swarmsim.autopilot.standin.settings import Manners
 from swarmsim.autopilot.standin.targets import Target
 
 STILL_M_S = 0.3
@@ -33,7 +33,7 @@ def vector(x: Array) -> Vector:
 class Activity:
     """One thing that the vehicle does; ``done`` when its end is reached."""
 
-    settings: Settings
+    settings: Manners
     flies: bool
     yaw_rad: float
     done: bool = False

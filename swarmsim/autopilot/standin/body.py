@@ -194,12 +194,16 @@ def scenario_alone(mission: str | None, vehicle: str | None, step_s: float, defa
     if mission is None:
         member = TeamMember(name=vehicle or "vehicle", type=default["type"], position_m=tuple(default["position_m"]))
         return scenario_of(_alone(member, load_named("vehicles", member.type), step_s, site=default["site"]))
-    whole = load_scenario(mission)
+    return alone_of(load_scenario(mission), vehicle, step_s)
+
+
+def alone_of(whole: Scenario, vehicle: str | None, step_s: float) -> Scenario:
+    """The scenario of one vehicle of a loaded mission, the first one by default, as `scenario_alone`."""
     names = [member.name for member in whole.members]
     chosen = vehicle if vehicle is not None else names[0]
     if chosen not in names:
         raise InputError.of(
-            f"mission '{mission}' has no vehicle '{chosen}'",
+            f"mission '{whole.mission.name}' has no vehicle '{chosen}'",
             given=chosen,
             allowed=one_of(names),
             suggestion=did_you_mean(chosen, names),

@@ -30,21 +30,26 @@ class Setpoints(Model):
     timeout_s: Duration | None
 
 
-class Settings(Model):
-    """One kind of autopilot. A whole number among the ``parameters`` is an integer parameter."""
+class Manners(Model):
+    """How fast a simulated vehicle flies what it does by itself, and how often it is stepped."""
 
-    autopilot: Kind
     step_s: float = Field(ge=0.005, le=0.1)
-    ready_s: Delay
-    origin: Origin
-    default: DefaultVehicle
-    version: tuple[int, int, int]
     take_off_speed_m_s: Speed
     land_speed_m_s: Speed
     land_speed_high_m_s: Speed
     land_low_m: Length
     return_speed_m_s: Speed
     arrived_m: Length
+
+
+class Settings(Manners):
+    """One kind of autopilot. A whole number among the ``parameters`` is an integer parameter."""
+
+    autopilot: Kind
+    ready_s: Delay
+    origin: Origin
+    default: DefaultVehicle
+    version: tuple[int, int, int]
     gps_coast_s: Delay
     streams: dict[str, Rate]
     status_text: bool

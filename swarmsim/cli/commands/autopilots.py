@@ -26,6 +26,7 @@ def fly(
     live: bool = False,
     live_url: str | None = None,
     force: bool = False,
+    manual: Literal["keyboard", "gamepad"] | None = None,
 ) -> int:
     """Fly one vehicle of a mission on a real autopilot; the others are simulated around it.
 
@@ -37,9 +38,15 @@ def fly(
         swarmsim fly recon --vehicle uav1 --link pelican:/dev/ttyUSB0
         swarmsim fly recon --vehicle uav1 --recover land
         swarmsim fly recon --vehicle uav1 --live
+        swarmsim fly recon --vehicle uav1 --link sim: --manual keyboard
 
     How it flies (limits, watchdogs, what it does at the end) stands under 'autopilot' in the mission. Ctrl-C ends the
     flight as autopilot.at_end says. An operator who changes the mode takes over for good.
+
+    With --manual the mission begins as without it. The space bar (A on a gamepad) takes the vehicle over at once, also
+    before it has taken off, and hands it back: the mission goes on from where it is, and the other vehicles meanwhile.
+    Arrows move it, w and s climb and sink, a and d turn, h holds, l lands, r returns; + and - change the speed. A key
+    counts while it repeats: without keys the vehicle stops and holds. Speeds and keys: autopilot.manual in the mission.
 
     Parameters
     ----------
@@ -50,7 +57,7 @@ def fly(
     link
         Where the autopilot is: udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or
         serial:DEVICE:BAUD for PX4 and ArduPilot, ardrone:HOST for an AR.Drone 2.0, pelican:DEVICE for an AscTec
-        Pelican.
+        Pelican. sim: is a vehicle simulated in this process, in real time.
     profile
         Which autopilot it is; auto (the default) takes what it says of itself.
     system
@@ -73,12 +80,14 @@ def fly(
         Show it in a Rerun viewer that runs elsewhere: rerun+http://HOST:PORT/proxy.
     force
         Replace earlier results.
+    manual
+        What a pilot may take the vehicle over with.
     """
     from swarmsim.cli.fly import fly_mission
 
     return fly_mission(
         scenario, vehicle, link, profile, system, seed, overrides, out, force, signing_key, recover, dry_run, live,
-        live_url,
+        live_url, manual,
     )  # fmt: skip
 
 
