@@ -131,12 +131,15 @@ def test_released_sticks_brake_and_hold_the_place():
     assert flown.pilot.holds
     held, place = last.position_m, flown.place.copy()
     assert last.velocity_m_s == (0.0, 0.0, 0.0)
+    assert (last.yaw_rad, last.yaw_rate_rad_s) == (0.0, None)
     flown.place = flown.place + np.array([1.0, 0.5, -0.3])  # a gust
     assert flown.fly(CENTRED, 6.0).position_m == held
     assert math.dist(flown.place, place) < 0.3
     turned = flown.fly(Sticks(turn=1.0), 1.0)
     assert turned.position_m == held  # it turns where it is
     assert turned.yaw_rate_rad_s > 0.0
+    still = flown.fly(CENTRED, 1.0)
+    assert (still.position_m, still.yaw_rad) == (held, pytest.approx(flown.yaw, abs=0.2))
     assert flown.fly(Sticks(left=0.2), 0.1).position_m is None
 
 

@@ -40,6 +40,7 @@ class Pilot:
         self._released_s: float | None = None  # since when no stick moves it
         self._height_m: float | None = None  # held
         self._place_m: Vector | None = None  # held
+        self._yaw_rad: float | None = None  # held with the place
 
     @property
     def holds(self) -> bool:
@@ -92,8 +93,17 @@ class Pilot:
         elif self._place_m is None:
             self._hold(t, now_s)
         if self._place_m is not None:
-            return Setpoint(position_m=self._place_m, velocity_m_s=_STILL, yaw_rate_rad_s=self._turn)
+            return self._held(t)
         return self._move(sticks, t, dt)
+
+    def _held(self, t: Telemetry) -> Setpoint:
+        """The place, and the heading where it does not turn: some vehicles drift at a turn rate of zero."""
+        if self._turn:
+            self._yaw_rad = None
+        elif self._yaw_rad is None and heading_known(t):
+            self._yaw_rad = _heading(t)
+        rate = self._turn if self._yaw_rad is None else None
+        return Setpoint(self._place_m, _STILL, yaw_rad=self._yaw_rad, yaw_rate_rad_s=rate)
 
     def _hold(self, t: Telemetry, now_s: float) -> None:
         """Keep the place, where it has stopped; one that is far outside of its volume is brought back before."""
@@ -105,7 +115,7 @@ class Pilot:
             return
         place = self._guard.nearest(here)
         if place is not None and math.dist(place, here) <= FAR_M:
-            self._place_m, self._height_m, self._up = place, None, 0.0
+            self._place_m, self._height_m, self._up, self._yaw_rad = place, None, 0.0, None
             self._guard.forget()
 
     def _move(self, sticks: Sticks, t: Telemetry, dt: float) -> Setpoint:
@@ -172,9 +182,12 @@ def place_of(t: Telemetry) -> Vector | None:
 
 def _heading(t: Telemetry) -> float:
     """Yaw, counter-clockwise from east; 0 where it is not known."""
-    if t.quaternion is None or not np.isfinite(t.quaternion).all():
-        return 0.0
-    return yaw_of_quaternion(t.quaternion)
+    return yaw_of_quaternion(t.quaternion) if t.quaternion is not None and heading_known(t) else 0.0
+
+
+def heading_known(t: Telemetry) -> bool:
+    """Whether the attitude is known."""
+    return t.quaternion is not None and bool(np.isfinite(t.quaternion).all())
 
 
 def _within(vector: np.ndarray, most: float) -> np.ndarray:
