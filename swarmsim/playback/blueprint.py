@@ -9,7 +9,7 @@ import rerun.blueprint as rrb
 
 from swarmsim.playback.colours import DRIVEN, measured_phases
 from swarmsim.playback.entities import TIMELINE, measurements_path, measurers, path_of, trails
-from swarmsim.playback.overlay import Overlay, error_view, height_view, side_view, top_view
+from swarmsim.playback.overlay import Overlay, error_view, height_view, side_view, speed_view, top_view
 from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 
@@ -40,7 +40,8 @@ def blueprint(record: MissionRecord, site_model: SiteModel, overlay: Overlay | N
 
 def track_blueprint(overlay: Overlay, site: bool) -> rrb.Blueprint:
     """The layout of a flight alone: its tracks from the side and from above, its errors and heights."""
-    plots = rrb.Horizontal(error_view(overlay), height_view(overlay))
+    errors = [error_view(overlay)] if overlay.has_errors() else []
+    plots = rrb.Horizontal(*errors, speed_view(overlay), height_view(overlay))
     return _laid_out(
         rrb.Horizontal(
             rrb.Vertical(side_view(overlay, site), plots, row_shares=[2.0, 1.0]),

@@ -34,23 +34,15 @@ def write_figure(overlay: Overlay, site_model: SiteModel | None, folder: Path) -
 
 
 def flown_figure(overlay: Overlay, site_model: SiteModel | None) -> Figure:
-    """A double-column figure: the tracks from above, at its side the horizontal errors and the heights over time."""
+    """A double-column figure: the tracks from above, at its side errors (or speeds) and heights over time."""
     figure = plan.new_figure(plan.DOUBLE_COLUMN_IN, _HEIGHT_IN)
     _draw_above(figure.add_axes(_LEFT), overlay, site_model)
-    if _has_errors(overlay):
-        errors = figure.add_axes((_RIGHT[0], 0.51, _RIGHT[1], 0.335))
-        heights = figure.add_axes((_RIGHT[0], 0.125, _RIGHT[1], 0.335), sharex=errors)
-        _draw_errors(errors, overlay)
-        errors.tick_params(labelbottom=False)
-    else:
-        heights = figure.add_axes((_RIGHT[0], 0.125, _RIGHT[1], 0.72))
+    over = figure.add_axes((_RIGHT[0], 0.51, _RIGHT[1], 0.335))
+    heights = figure.add_axes((_RIGHT[0], 0.125, _RIGHT[1], 0.335), sharex=over)
+    (_draw_errors if overlay.has_errors() else _draw_speeds)(over, overlay)
+    over.tick_params(labelbottom=False)
     _draw_heights(heights, overlay)
     return figure
-
-
-def _has_errors(overlay: Overlay) -> bool:
-    made = overlay.comparison
-    return bool(np.isfinite(made.cross_track_m).any() or np.isfinite(made.synchronised_m).any())
 
 
 def _draw_above(axes: Axes, overlay: Overlay, site_model: SiteModel | None) -> None:
@@ -80,7 +72,7 @@ def _draw_above(axes: Axes, overlay: Overlay, site_model: SiteModel | None) -> N
 def _fit(axes: Axes, low: NDArray[np.floating], high: NDArray[np.floating]) -> None:
     """Limits to scale that fill the axes, with the tracks in their middle."""
     figure = axes.figure
-    box = axes.get_position()
+    box = axes.get_position(original=True)
     shape = box.width * figure.get_figwidth() / (box.height * figure.get_figheight())  # type: ignore[union-attr]
     size = np.maximum(high - low, _LEAST_M)
     size = size + 2.0 * _MARGIN * size.max()
@@ -107,15 +99,22 @@ def _draw_errors(axes: Axes, overlay: Overlay) -> None:
     plan.legend_above(axes, 1)
 
 
+def _draw_speeds(axes: Axes, overlay: Overlay) -> None:
+    judged = overlay.judged
+    if len(judged.time_s):
+        axes.plot(judged.time_s, judged.speed_m_s(judged.time_s), "-", color=FLOWN, linewidth=0.8, label="flown")
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel("Speed [m/s]")
+    axes.grid(color="0.9", linewidth=0.5)
+    axes.set_axisbelow(True)
+    plan.legend_above(axes, 1)
+
+
 def _draw_heights(axes: Axes, overlay: Overlay) -> None:
     track, judged = overlay.simulated_track(), overlay.judged
-    handles = []
     if track is not None:
-        handles += axes.plot(
-            track.time_s, track.position_m[:, 2], "-", color=SIMULATED, linewidth=1.8, label="simulated"
-        )
-    handles += axes.plot(overlay.flown.time_s, overlay.flown.position_m[:, 2], "-", color=FLOWN, linewidth=0.8,
-                         label="flown")  # fmt: skip
+        axes.plot(*_height(track), "-", color=SIMULATED, linewidth=1.8)
+    axes.plot(*_height(overlay.flown), "-", color=FLOWN, linewidth=0.8)
     if len(judged.time_s) > 1:
         axes.set_xlim(judged.time_s[0], judged.time_s[-1])
         shown = np.concatenate([judged.position_m[:, 2], *([] if track is None else [track.position_m[:, 2]])])
@@ -125,8 +124,6 @@ def _draw_heights(axes: Axes, overlay: Overlay) -> None:
     axes.set_ylabel("Height [m]")
     axes.grid(color="0.9", linewidth=0.5)
     axes.set_axisbelow(True)
-    if not _has_errors(overlay):
-        plan.legend_above(axes, 2, handles)
 
 
 def _height(track: Track) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -40,6 +40,11 @@ class Overlay:
             return None
         return Track(self.simulated.track.time_s + shift, self.simulated.track.position_m)
 
+    def has_errors(self) -> bool:
+        """Whether there is anything that the flown track could be compared with."""
+        made = self.comparison
+        return bool(np.isfinite(made.cross_track_m).any() or np.isfinite(made.synchronised_m).any())
+
     def bounds_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lowest and highest corner [3] of what was judged, the paths and the simulated track."""
         parts = [path.points_m for path in self.planned]
@@ -77,12 +82,21 @@ def send_overlay(stream: rr.RecordingStream, overlay: Overlay) -> None:
     ):
         if each is not None:
             _series(stream, f"{STATES}/height/{name}", label, colour, each.time_s, each.position_m[:, 2])
+            speed = each.speed_m_s(each.time_s) if len(each.time_s) else np.zeros(0)
+            _series(stream, f"{STATES}/speed/{name}", label, colour, each.time_s, speed)
 
 
 def error_view(overlay: Overlay, name: str = "Flown: error [m]") -> rrb.TimeSeriesView:
     """The errors over the time that was judged."""
     made = overlay.comparison
     return _plot(ERRORS, name, overlay, made.cross_track_m, made.synchronised_m, made.above_m)
+
+
+def speed_view(overlay: Overlay) -> rrb.TimeSeriesView:
+    """Horizontal speeds of the flown and the simulated vehicle."""
+    tracks = [track for track in (overlay.judged, overlay.simulated_track()) if track is not None]
+    shown = (track.speed_m_s(track.time_s) for track in tracks if len(track.time_s))
+    return _plot(f"{STATES}/speed", "Horizontal speed [m/s]", overlay, *shown)
 
 
 def height_view(overlay: Overlay) -> rrb.TimeSeriesView:

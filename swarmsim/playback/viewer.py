@@ -1,6 +1,8 @@
 """Open a run's recording in the Rerun viewer."""
 
 import contextlib
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -83,11 +85,19 @@ def _start_viewer(command: list[str], port: int) -> None:
             return
     code = viewer.poll()
     if code is None:
-        viewer.kill()
-        viewer.wait()
+        _end(viewer)
     told = f"did not answer within {_START_S:g} s" if code is None else f"ended with exit code {code}"
     hint = "on a machine without a display, start 'rerun' on another one and name it with --live-url"
     raise InputError.of(f"the Rerun viewer {told}", path="--live", suggestion=hint)
+
+
+def _end(viewer: subprocess.Popen[bytes]) -> None:
+    """End a viewer with what it started: `python -m rerun` runs the viewer as a process of its own."""
+    if sys.platform == "win32":
+        viewer.kill()
+    else:
+        os.killpg(viewer.pid, signal.SIGKILL)  # it leads a session of its own
+    viewer.wait()
 
 
 def _answers(host: str, port: int) -> bool:
