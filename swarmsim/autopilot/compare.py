@@ -29,7 +29,8 @@ GAP_S = 1.0  # between two positions farther apart in time nothing is assumed
 OVERLAP = 0.8  # of the shorter track must be compared, or a shift is none
 CORNER_M = 0.5  # a path that bends by less is one leg
 LEG_M = 2.0  # shorter ones are corners
-_COARSE_S, _COARSE_MAX = 0.25, 2000  # step of the first search for the shift, and its greatest number of samples
+LONG_S = 50_000.0
+_COARSE_S, _COARSE_MAX, _SHIFTS_MAX = 0.25, 2000, 8000  # first search for the shift: step, most samples, most shifts
 _SPEED_OVER_S = 1.0
 _CHUNK = 256
 
@@ -185,13 +186,15 @@ def compare(
 
 
 def _times(flown: Track, simulated: Simulated | None, shift: float | None) -> Floats:
-    """Evenly spaced times of the common part."""
+    """Evenly spaced times of the common part; in a very long one those of the flown track."""
     if not len(flown.time_s):
         return np.zeros(0)
     low, high = float(flown.time_s[0]), float(flown.time_s[-1])
     if simulated is not None and shift is not None:
         low = max(low, float(simulated.track.time_s[0]) + shift)
         high = min(high, float(simulated.track.time_s[-1]) + shift)
+    if high - low > LONG_S:
+        return flown.time_s[(flown.time_s >= low) & (flown.time_s <= high)]
     return np.asarray(low + STEP_S * np.arange(max(0, int((high - low) / STEP_S + 1e-6)) + 1), np.float64)
 
 
@@ -281,8 +284,8 @@ def time_shift_s(flown: Track, simulated: Track) -> float | None:
             return np.inf
         return float(np.sqrt(np.mean(np.sum(error[known] ** 2, axis=1))))
 
-    step = max(_COARSE_S, max(spans) / _COARSE_MAX)
-    times, there = _grid(simulated, min(step, spans[1] / 8.0))
+    step = max(_COARSE_S, sum(spans) / _SHIFTS_MAX)
+    times, there = _grid(simulated, min(max(_COARSE_S, spans[1] / _COARSE_MAX), spans[1] / 8.0))
     first = float(flown.time_s[0] - simulated.time_s[-1])
     shifts = first + step * np.arange(int(sum(spans) / step) + 2)
     found = np.array([rms(float(shift), times, there) for shift in shifts])

@@ -4,9 +4,10 @@ World ENU about the log's origin, body FLU, SI units. Times are those of the veh
 position.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,12 @@ Floats = NDArray[np.float64]
 Format = Literal["tlog", "bin", "ulg"]
 STALE_S = 1.0  # an attitude older than this is not that of a position
 UNKNOWN = "unknown"
+_NEIGHBOURS = 7  # positions by which one is judged
+_FAR_S, _FAR_M = 60.0, 100.0
+_ABSURD = 1e10
+_FAST_M_S = 1e4
+_AROUND_S = 3600.0
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 @dataclass(frozen=True)
@@ -130,20 +137,32 @@ def assembled(
 
     Of positions at the same time the last counts. Raises `ValueError` where there is none.
     """
-    order = _increasing(found.time_s, np.isfinite(found.position_ned_m).all(axis=1))
+    notes = list(notes)
+    known = np.isfinite(found.position_ned_m).all(axis=1)
+    sound = np.flatnonzero(known)[_sound(found.time_s[known], found.position_ned_m[known])]
+    if len(sound) < known.sum():
+        notes.append(f"{known.sum() - len(sound)} positions are far from those before and after them: left out")
+    order = sound[_increasing(found.time_s[sound])]
     if not len(order):
         raise ValueError("no position")
     start = float(found.time_s[order[0]])
     time_s = found.time_s[order] - start
-    battery, setpoints = found.battery or Series(np.zeros(0), np.zeros(0)), found.setpoints_ned_m or empty(3)
+    battery = _ordered(found.battery or Series(np.zeros(0), np.zeros(0)))
+    setpoints = _ordered(found.setpoints_ned_m or empty(3))
+    velocity = found.velocity_ned_m_s[order]
 
     def changes(raw: Sequence[tuple[float, str]], every: bool = False) -> tuple[Change, ...]:
+        """In order of time, without what was told long before or after the positions."""
         told: list[Change] = []
         for when, name in sorted(raw, key=lambda pair: pair[0]):
-            if every or not told or told[-1].name != name:
-                told.append(Change(float(when) - start, name))
+            inside = -_AROUND_S < when - start < time_s[-1] + _AROUND_S
+            if inside and (every or not told or told[-1].name != name):
+                told.append(Change(float(when) - start, readable(name)))
         return tuple(told)
 
+    armed = changes([(when, "armed" if armed else "disarmed") for when, armed in found.armed])
+    if armed and armed[-1].name == "armed":
+        notes.append("the log ends while the vehicle is armed: it was cut, or the vehicle lost its power")
     return FlightLog(
         format=format_,
         autopilot=autopilot,
@@ -152,10 +171,10 @@ def assembled(
         origin=found.origin,
         time_s=time_s,
         position_m=enu_of_ned(found.position_ned_m[order]),
-        velocity_m_s=enu_of_ned(found.velocity_ned_m_s[order]),
+        velocity_m_s=enu_of_ned(np.where(np.abs(velocity) < _FAST_M_S, velocity, np.nan)),
         quaternion=quaternion_enu_of_ned(_nearest(found.attitude, found.time_s[order])),
         modes=changes(found.modes),
-        armed=changes([(when, "armed" if armed else "disarmed") for when, armed in found.armed]),
+        armed=armed,
         messages=changes(found.messages, every=True),
         battery=Series(battery.time_s - start, battery.values),
         setpoints=Series(setpoints.time_s - start, enu_of_ned(setpoints.values)),
@@ -174,19 +193,47 @@ def profile_of(autopilot: int, vehicle_type: int) -> tuple[str, Profile | None]:
     return profile.autopilot.name, profile
 
 
-def _increasing(time_s: Floats, valid: Any) -> NDArray[np.intp]:
-    """Rows that are ``valid`` [n], in order of time, each time once."""
-    rows = np.flatnonzero(valid & np.isfinite(time_s))
-    rows = rows[np.argsort(time_s[rows], kind="stable")]
+def readable(text: str) -> str:
+    """A text without colours of terminals and other characters that cannot be shown."""
+    return "".join(c if c.isprintable() else " " for c in _COLOURS.sub("", text)).strip()
+
+
+def _sound(time_s: Floats, position_m: Floats) -> NDArray[np.bool_]:
+    """Rows [n] in the order of the file that are near the median of their neighbours, in time and in space.
+
+    Two of the three kinds of logs have no checksums: damage there leaves numbers that make no sense.
+    """
+    right: NDArray[np.bool_] = np.isfinite(time_s)
+    reach = _NEIGHBOURS // 2
+    for values, far in ((time_s, _FAR_S), *((column, _FAR_M) for column in position_m.T)):
+        if len(values) < _NEIGHBOURS:
+            right &= np.abs(values) < _ABSURD
+            continue
+        bounded = np.clip(np.nan_to_num(values, nan=_ABSURD), -_ABSURD, _ABSURD)
+        windows = np.lib.stride_tricks.sliding_window_view(bounded, _NEIGHBOURS)
+        middle = np.median(windows, axis=1)
+        middle = np.r_[[middle[0]] * reach, middle, [middle[-1]] * reach]
+        right &= np.abs(bounded - middle) <= far
+    return right
+
+
+def _increasing(time_s: Floats) -> NDArray[np.intp]:
+    """Rows in order of time, each time once."""
+    rows = np.argsort(time_s, kind="stable")
     return rows[np.r_[np.diff(time_s[rows]) > 0.0, True]] if len(rows) else rows
+
+
+def _ordered(series: Series) -> Series:
+    order = np.argsort(series.time_s, kind="stable")
+    return Series(series.time_s[order], series.values[order])
 
 
 def _nearest(series: Series, time_s: Floats) -> Floats:
     """The values [n, k] of a series that are nearest in time, NaN where none is near."""
     if not len(series.time_s):
         return np.full((len(time_s), series.values.shape[1]), np.nan)
-    order = np.argsort(series.time_s, kind="stable")
-    times, values = series.time_s[order], series.values[order]
+    series = _ordered(series)
+    times, values = series.time_s, series.values
     above = np.clip(np.searchsorted(times, time_s), 0, len(times) - 1)
     below = np.maximum(above - 1, 0)
     nearest = np.where(np.abs(times[below] - time_s) <= np.abs(times[above] - time_s), below, above)

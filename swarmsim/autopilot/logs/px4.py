@@ -24,6 +24,7 @@ _TOPICS = [
 ]
 _FIELDS_MAX = 5000  # of a topic, arrays counted in full; those of PX4 have fewer than 300
 _DEPTH_MAX = 10  # of topics in topics
+_HEADER_BYTES = 3  # of a message
 _ARMED = 2  # vehicle_status.arming_state
 
 Topic = dict[str, Any]
@@ -36,6 +37,13 @@ class _Kept(io.BufferedReader):
     def __init__(self, path: Path):
         super().__init__(io.FileIO(path))
         self.read_to = 0
+        self.cut = False  # the last message is not whole
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        asked = -1 if size is None else size
+        self.cut = len(data) < asked and (asked != _HEADER_BYTES or len(data) > 0)
+        return data
 
     def close(self) -> None:
         if not self.closed:
@@ -45,7 +53,7 @@ class _Kept(io.BufferedReader):
 
 def read_ulog(path: Path, size: int, system: int | None) -> FlightLog:
     """The flight in a log of ``size`` bytes; raises `InputError` where it has no position, or is not of ``system``."""
-    log, read_to = _loaded(path)
+    log, file = _loaded(path)
     topics: dict[str, Topic] = {}
     for data in reversed(log.data_list):  # of several estimators or batteries the first
         topics[data.name] = data.data
@@ -62,10 +70,12 @@ def read_ulog(path: Path, size: int, system: int | None) -> FlightLog:
             "the log holds no position (topic vehicle_local_position)",
             suggestion="the vehicle had no position estimate, or SDLOG_PROFILE leaves it out",
         )
-    notes = [f"parts of the log are damaged: {size - read_to} of {size} bytes at its end were not read"] * (
-        read_to < size
-    )
-    if log.file_corruption and not notes:
+    notes = []
+    if file.read_to < size:
+        notes.append(f"the log is damaged: {size - file.read_to} of {size} bytes at its end were not read")
+    elif file.cut:
+        notes.append("the log breaks off in the middle of a message")
+    if log.file_corruption:
         notes.append("parts of the log are damaged: left out")
     lost = sum(dropout.duration for dropout in log.dropouts)
     if lost:
@@ -74,8 +84,8 @@ def read_ulog(path: Path, size: int, system: int | None) -> FlightLog:
     return assembled(track, "ulg", profile, autopilot, number, notes)
 
 
-def _loaded(path: Path) -> tuple[ULog, int]:
-    """The log, and to which byte it was read. pyulog prints what it finds damaged."""
+def _loaded(path: Path) -> tuple[ULog, _Kept]:
+    """The log, and the file as it was left. pyulog prints what it finds damaged."""
     try:
         with contextlib.redirect_stdout(io.StringIO()), _Kept(path) as head, _Kept(path) as whole:
             _check_formats(ULog(head, parse_header_only=True))
@@ -84,7 +94,7 @@ def _loaded(path: Path) -> tuple[ULog, int]:
         raise
     except Exception as error:  # whatever hostile bytes do to pyulog, it is a file that cannot be read
         raise InputError.of(f"this PX4 log cannot be read ({error})") from error
-    return log, whole.read_to
+    return log, whole
 
 
 def _check_formats(header: ULog) -> None:

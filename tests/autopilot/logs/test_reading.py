@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from swarmsim.autopilot.frames import Geodetic, enu_of_geodetic
-from swarmsim.autopilot.logs.flight_log import Change
+from swarmsim.autopilot.logs.flight_log import Change, readable
 from swarmsim.autopilot.logs.reading import read_log
 from swarmsim.config.errors import InputError
 from tests.autopilot.logs import writers
@@ -67,7 +67,8 @@ def test_a_log_that_breaks_off_is_read_as_far_as_it_goes(kind, share, tmp_path):
     data = WRITTEN[kind]
     log = read(tmp_path, kind, data[: int(share * len(data)) + 5])
     assert share * 30.0 - 2.0 < log.time_s[-1] < share * 30.0 + 2.0
-    assert log.notes or kind == "ulg"  # of a ULog file a message that was cut is no damage
+    assert any("breaks off" in note or "skipped" in note for note in log.notes)
+    assert ("ends while the vehicle is armed" in " ".join(log.notes)) is (share < writers.LEFT_S / 30.0)
     np.testing.assert_allclose(log.position_m, TRUTH.position_m[: len(log.time_s)], atol=1e-5)
 
 
@@ -101,6 +102,28 @@ def test_what_is_no_log_is_refused_in_a_sentence(kind, data, said, tmp_path):
         said = "position|no vehicle"
     with pytest.raises(InputError, match=said):
         read(tmp_path, kind, data)
+
+
+@pytest.mark.parametrize("kind", ["bin", "ulg"])
+def test_numbers_that_make_no_sense_are_left_out(kind, tmp_path):
+    """These two have no checksums: damage inside of a message is read."""
+    damaged = writers.Truth(*(each.copy() for each in vars(TRUTH).values()))
+    damaged.position_m[100] = (1e30, -5.0, 2.0)
+    damaged.position_m[101, 2] = 500.0
+    damaged.velocity_m_s[150, 0] = 1e35
+    damaged.time_s[200] = 1e12
+    write = {"bin": writers.dataflash, "ulg": writers.ulog}[kind]
+    log = read(tmp_path, kind, write(damaged))
+    assert len(log.time_s) == 297
+    assert log.time_s[-1] == pytest.approx(29.9, abs=0.01)
+    assert np.abs(log.position_m).max() < 20.0
+    assert np.isnan(log.velocity_m_s).any(axis=1).sum() == 1
+    assert any("3 positions" in note for note in log.notes)
+
+
+def test_words_come_without_the_colours_of_terminals():
+    assert readable("[commander] \x1b[32mReady for takeoff!\x1b[0m\t") == "[commander] Ready for takeoff!"
+    assert readable("a\x00b\x9bc") == "a b c"
 
 
 def test_files_that_cannot_be_read_are_told(tmp_path):

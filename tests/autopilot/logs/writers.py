@@ -132,13 +132,14 @@ def dataflash(truth: Truth, vehicle: str = "ArduCopter") -> bytes:
             put("MODE", t, 4, 4, 2)
         if k == round(LEFT_S * 10):
             put("MODE", t, 9, 9, 2)
+            put("ARM", t, 0, 0, 0, 0)
         place, speed = ned_of_enu(truth.position_m[k]), ned_of_enu(truth.velocity_m_s[k])
         put("XKF4", t, 0, 1)
         put("XKF1", t, 0, *speed, *(place + 5.0))
         put("XKF1", t, 1, *speed, *place)
         roll, pitch, yaw = np.degrees(ned_euler(truth.quaternion[k]))
         put("ATT", t, round(roll * 100), round(pitch * 100), round(yaw * 100))
-        put("BAT", t, 0, round(100 - t))
+        put("BAT", t, 0, round(100 - min(t, 30.0)))
         for axis, value in zip(("PSCN", "PSCE", "PSCD"), place, strict=True):
             put(axis, t, value, value)
     return bytes(data)
