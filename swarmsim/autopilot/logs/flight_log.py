@@ -151,16 +151,8 @@ def assembled(
     setpoints = _ordered(found.setpoints_ned_m or empty(3))
     velocity = found.velocity_ned_m_s[order]
 
-    def changes(raw: Sequence[tuple[float, str]], every: bool = False) -> tuple[Change, ...]:
-        """In order of time, without what was told long before or after the positions."""
-        told: list[Change] = []
-        for when, name in sorted(raw, key=lambda pair: pair[0]):
-            inside = -_AROUND_S < when - start < time_s[-1] + _AROUND_S
-            if inside and (every or not told or told[-1].name != name):
-                told.append(Change(float(when) - start, readable(name)))
-        return tuple(told)
-
-    armed = changes([(when, "armed" if armed else "disarmed") for when, armed in found.armed])
+    span = (start, float(found.time_s[order[-1]]))
+    armed = _changes([(when, "armed" if armed else "disarmed") for when, armed in found.armed], span)
     if armed and armed[-1].name == "armed":
         notes.append("the log ends while the vehicle is armed: it was cut, or the vehicle lost its power")
     return FlightLog(
@@ -173,14 +165,24 @@ def assembled(
         position_m=enu_of_ned(found.position_ned_m[order]),
         velocity_m_s=enu_of_ned(np.where(np.abs(velocity) < _FAST_M_S, velocity, np.nan)),
         quaternion=quaternion_enu_of_ned(_nearest(found.attitude, found.time_s[order])),
-        modes=changes(found.modes),
+        modes=_changes(found.modes, span),
         armed=armed,
-        messages=changes(found.messages, every=True),
+        messages=_changes(found.messages, span, every=True),
         battery=Series(battery.time_s - start, battery.values),
         setpoints=Series(setpoints.time_s - start, enu_of_ned(setpoints.values)),
         follow_modes=() if profile is None else profile.kind.follow,
         notes=tuple(notes),
     )
+
+
+def _changes(raw: Sequence[tuple[float, str]], span_s: tuple[float, float], every: bool = False) -> tuple[Change, ...]:
+    """In order of time from the begin of the span, without what was told long before or after it."""
+    told: list[Change] = []
+    for when, name in sorted(raw, key=lambda pair: pair[0]):
+        inside = span_s[0] - _AROUND_S < when < span_s[1] + _AROUND_S
+        if inside and (every or not told or told[-1].name != readable(name)):
+            told.append(Change(float(when) - span_s[0], readable(name)))
+    return tuple(told)
 
 
 def profile_of(autopilot: int, vehicle_type: int) -> tuple[str, Profile | None]:
