@@ -143,6 +143,12 @@ def test_what_happens_to_the_vehicle_ends_the_flight(autopilot, what, reason, tm
         (["--vehicle", "nobody"], "uav"),
         (["--vehicle", "uav", "--link", "carrier:pigeon"], "udpin"),
         (["--vehicle", "uav", "--set", "autopilot.stream_hz=1"], "stream_hz"),
+        (["--vehicle", "uav", "--link", "sim:somewhere"], "sim:"),
+        (["--vehicle", "uav", "--link", "sim:", "--recover", "land"], "none to be found"),
+        (["--vehicle", "uav", "--manual", "keyboard"], "standard input"),
+        (["--vehicle", "uav", "--manual", "gamepad", "--set", "autopilot.manual.device=/nowhere"], "/nowhere"),
+        (["--vehicle", "uav", "--manual", "keyboard", "--dry-run"], "--manual"),
+        (["--vehicle", "uav", "--set", "autopilot.manual.keys.land=space"], "twice"),
     ],
 )
 def test_wrong_input_is_told(arguments, word, capsys):

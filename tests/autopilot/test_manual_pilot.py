@@ -245,6 +245,21 @@ def test_the_way_back_is_slow_and_is_not_refused(policy, place):
     assert before is None or math.dist(before, policy) < JOINED_M + MANUAL.speed_m_s * DT
 
 
+@pytest.mark.parametrize("speed", [0.5, 2.5, 6.0])
+def test_the_way_back_catches_up_with_a_policy_that_flies_on(speed):
+    guard, here, now = guard_of(), Telemetry(position_m=(-45.0, -3.0, 5.0)), 0.0
+    way, place, v = Rejoin(MANUAL, guard, here, 0.0), np.array([-45.0, 0.0, 8.0]), np.array([speed, 0.0, 0.3])
+    while now < 10.0:
+        now += DT
+        place = place + DT * v
+        setpoint = way.setpoint(Setpoint(position_m=tuple(place), velocity_m_s=tuple(v)), here, now)
+        if setpoint is None:
+            return
+        guard.check(setpoint, now)
+        here = replace(here, position_m=setpoint.position_m)
+    pytest.fail(f"still {math.dist(place, here.position_m):.1f} m away")
+
+
 def test_the_way_back_waits_for_a_vehicle_that_does_not_follow():
     here = Telemetry(position_m=(0.0, 0.0, 5.0))
     way = Rejoin(MANUAL, guard_of(), here, 0.0)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmsim.autopilot.opening import ArdroneAddress, PelicanAddress, log_suffix, open_vehicle, parse
+from swarmsim.autopilot.opening import ArdroneAddress, PelicanAddress, SimulatedAddress, log_suffix, open_vehicle, parse
 from swarmsim.config.errors import InputError
 
 
@@ -17,6 +17,7 @@ from swarmsim.config.errors import InputError
         ("ardrone:127.0.0.1:15556:15554", ArdroneAddress("127.0.0.1", 15556, 15554)),
         ("pelican:/dev/ttyUSB0", PelicanAddress("/dev/ttyUSB0", 57_600)),
         (" pelican:COM3:115200 ", PelicanAddress("COM3", 115_200)),
+        ("sim:", SimulatedAddress()),
         ("udpin:127.0.0.1:14540", "udpin:127.0.0.1:14540"),
         ("serial:/dev/ttyUSB0:57600", "serial:/dev/ttyUSB0:57600"),
     ],
@@ -31,12 +32,13 @@ def test_a_link_string_means_one_link(link, meant):
     [
         "", "ardrone", "ardrone:", "ardrone:h:1", "ardrone:h:1:0", "ardrone:h:1:2:3", "ardrone:h:1:x", "ardrone:a b",
         "pelican:", "pelican:/dev/x:0", "pelican:/dev/x:fast", "pelican:/dev/x:99999999999", "udpin:x", "pigeon:home",
+        "sim", "sim:x",
     ],
 )  # fmt: skip
 def test_a_wrong_one_is_told_with_every_form_that_is_allowed(link):
     with pytest.raises(InputError) as found:
         parse(link)
-    for form in ("udpin", "tcp:", "serial:", "ardrone:HOST", "pelican:DEVICE"):
+    for form in ("udpin", "tcp:", "serial:", "ardrone:HOST", "pelican:DEVICE", "sim:"):
         assert form in str(found.value)
 
 
@@ -58,3 +60,10 @@ def test_no_text_breaks_it(text):
 def test_what_does_not_go_with_a_link_is_refused(link, arguments, word):
     with pytest.raises(InputError, match=word):
         open_vehicle(link, **arguments)
+
+
+def test_a_simulated_vehicle_is_that_of_a_mission():
+    with pytest.raises(InputError, match="none to be found"):
+        open_vehicle("sim:")
+    with pytest.raises(InputError, match="no such profile"):
+        open_vehicle("sim:", profile="px4")

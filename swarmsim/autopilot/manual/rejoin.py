@@ -3,7 +3,7 @@
 import numpy as np
 
 from swarmsim.autopilot.guard import Guard
-from swarmsim.autopilot.link import Setpoint, Telemetry
+from swarmsim.autopilot.link import Setpoint, Telemetry, Vector
 from swarmsim.autopilot.manual.pilot import place_of
 from swarmsim.config.manual import Manual
 
@@ -14,7 +14,7 @@ STEP_MAX_S = 0.5  # between two of the policy's setpoints; after a pause the ref
 
 
 class Rejoin:
-    """Leads a reference on a straight line to the policy's position, which itself waits for the vehicle.
+    """Leads a reference to the policy's position, straight as seen from there; it moves along with that.
 
     Without it the autopilot would fly there as fast as it can.
     """
@@ -27,7 +27,7 @@ class Rejoin:
         self._speed_max = min(manual.speed_m_s, limits.speed_m_s)
         self._climb_max = min(manual.climb_m_s, limits.climb_m_s)
         self._acceleration = min(manual.acceleration_m_s2, limits.acceleration_m_s2)
-        self._speed, self._now_s = 0.0, now_s
+        self._speed, self._now_s, self._guard = 0.0, now_s, guard
         guard.forget()
 
     def setpoint(self, policy: Setpoint, t: Telemetry, now_s: float) -> Setpoint | None:
@@ -45,10 +45,27 @@ class Rejoin:
         most = min(most, float(np.sqrt(2.0 * self._acceleration * far)) + LAST_M_S)
         waits = float(np.linalg.norm(self._place - here)) > LAG_M
         self._speed = 0.0 if waits else min(most, self._speed + self._acceleration * dt)
-        self._place = self._place + min(far, self._speed * dt) * along
-        x, y, z = (float(v) for v in self._place)
-        vx, vy, vz = (float(v) for v in self._speed * along)
+        moves = np.zeros(3) if waits or policy.velocity_m_s is None else np.asarray(policy.velocity_m_s, np.float64)
+        velocity = self._limited(self._speed * along + moves)
+        step = self._limited(min(far / max(dt, 1e-9), self._speed) * along + moves) * dt
+        place = self._guard.nearest(_vector(self._place + step))
+        if place is None:
+            return None
+        self._place = np.array(place)
         return Setpoint(
-            position_m=(x, y, z), velocity_m_s=(vx, vy, vz), yaw_rad=policy.yaw_rad,
+            position_m=place, velocity_m_s=_vector(velocity), yaw_rad=policy.yaw_rad,
             yaw_rate_rad_s=policy.yaw_rate_rad_s,
         )  # fmt: skip
+
+    def _limited(self, velocity: np.ndarray) -> np.ndarray:
+        """A velocity within the limits of setpoints."""
+        limits = self._guard.limits
+        level = float(np.hypot(velocity[0], velocity[1]))
+        share = min(1.0, limits.speed_m_s / max(level, 1e-9))
+        climb = float(np.clip(velocity[2], -limits.climb_m_s, limits.climb_m_s))
+        return np.array([share * velocity[0], share * velocity[1], climb])
+
+
+def _vector(values: np.ndarray) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
