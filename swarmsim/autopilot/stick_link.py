@@ -8,6 +8,7 @@ import contextlib
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -77,7 +78,7 @@ class WireLog:
             self._file = None
 
 
-class StickLink:
+class StickLink(ABC):
     """The common part of a `VehicleLink`; what a vehicle says and takes is in the subclasses.
 
     A subclass calls `_begin` when its wire is open and `_refresh` whenever it has heard something. It gives `_snapshot`
@@ -104,17 +105,17 @@ class StickLink:
 
     # what a subclass gives
 
+    @abstractmethod
     def _snapshot(self) -> Telemetry:
         """What is known, positions relative to the vehicle's own origin."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _tick(self, now_s: float, dt_s: float) -> None:
         """Send what is due in this period."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _why_not_follow(self) -> str | None:
         """Why it cannot be flown from here now; None if it can."""
-        raise NotImplementedError
 
     # what it tells
 

@@ -4,6 +4,7 @@ import contextlib
 import select
 import socket
 import time
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -135,15 +136,16 @@ class _Udp:
         self._socket.close()
 
 
-class _Stream:
+class _Stream(ABC):
     """A TCP connection that is made anew when it is lost."""
 
     def __init__(self) -> None:
         self._peer: socket.socket | None = None
         self._tried_s = 0.0
 
+    @abstractmethod
     def _connect(self) -> socket.socket | None:
-        raise NotImplementedError
+        """A new connection; None where there is none yet."""
 
     def read(self, timeout_s: float) -> tuple[bytes, Source]:
         peer = self._peer

@@ -1,6 +1,7 @@
 """What the stand-in flies by itself or when told: each activity turns the sensed state into a `Motion`. World ENU."""
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,7 +31,7 @@ def vector(x: Array) -> Vector:
 
 
 @dataclass
-class Activity:
+class Activity(ABC):
     """One thing that the vehicle does; ``done`` when its end is reached."""
 
     settings: Manners
@@ -38,9 +39,9 @@ class Activity:
     yaw_rad: float
     done: bool = False
 
+    @abstractmethod
     def motion(self, sensed: Sensed, dt: float) -> Motion:
         """The command of the next ``dt`` s."""
-        raise NotImplementedError
 
     def at(self, position_m: Array, velocity_m_s: Vector = (0.0, 0.0, 0.0), speed_m_s: float = 1.0) -> Motion:
         """Be at a position, with a velocity fed forward; ``speed_m_s`` is a rover's limit."""

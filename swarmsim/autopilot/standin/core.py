@@ -5,6 +5,7 @@ simulation since boot.
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +54,7 @@ class Command:
     frame: int | None = None  # of COMMAND_INT, whose fifth and sixth parameters are degrees here too
 
 
-class Autopilot:
+class Autopilot(ABC):
     """A vehicle's autopilot; what only PX4 or only ArduPilot does stands in the subclasses."""
 
     type_number: int  # MAV_AUTOPILOT
@@ -92,43 +93,47 @@ class Autopilot:
 
     # What the kinds differ in
 
+    @abstractmethod
     def mode_tables(self) -> tuple[dict[str, int], dict[str, str]]:
         """Custom mode and role (manual, hold, takeoff, return, land, follow) of each mode by its name."""
-        raise NotImplementedError
 
     def boot_mode(self) -> str:
         """The mode after boot."""
         return self.manual_mode
 
+    @abstractmethod
     def supervise(self) -> None:
         """Failsafes, once a step."""
 
+    @abstractmethod
     def finished(self) -> None:
         """An activity has come to its end."""
 
+    @abstractmethod
     def setpoint(self, message: Any) -> None:
         """A SET_POSITION_TARGET message."""
 
+    @abstractmethod
     def set_mode(self, name: str | None) -> list[int]:
         """Results of a mode command, in the order in which they are told."""
-        raise NotImplementedError
 
+    @abstractmethod
     def arm(self, force: bool) -> int:
         """Result of a command to arm."""
-        raise NotImplementedError
 
+    @abstractmethod
     def take_off(self, command: Command) -> int:
         """Result of a command to take off."""
-        raise NotImplementedError
 
+    @abstractmethod
     def disarm_command(self, command: Command) -> int:
         """Result of a command to disarm."""
-        raise NotImplementedError
 
     def prearm_checks(self) -> int:
         """Result of a command to run the checks before arming."""
         return int(mav.MAV_RESULT_UNSUPPORTED)
 
+    @abstractmethod
     def land_after_failure(self) -> None:
         """The state estimate has failed in flight."""
 
@@ -240,9 +245,9 @@ class Autopilot:
         height, wait = self.return_height_m()
         return self.make(Return, home_m=self.home_m, cruise_m=float(self.home_m[2]) + height, wait_s=wait)
 
+    @abstractmethod
     def return_height_m(self) -> tuple[float, float]:
         """Height above home of a flight home, and how long it waits there before it lands."""
-        raise NotImplementedError
 
     def make(self, kind: Any, **fields: Any) -> Any:
         """An activity that keeps the heading."""

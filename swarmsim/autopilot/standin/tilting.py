@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -94,7 +95,7 @@ def _turned(x: np.ndarray, angle_rad: float) -> np.ndarray:
     return np.array([c * x[0] - s * x[1], s * x[0] + c * x[1]])
 
 
-class StickStandin:
+class StickStandin(ABC):
     """A stand-in that steps a body: `step` by a test, or in real time (times ``speed``) as a context manager."""
 
     exit_code: int | None = None
@@ -112,26 +113,26 @@ class StickStandin:
         self._thread = threading.Thread(target=self._run, name=type(self).__name__, daemon=True)
 
     @property
+    @abstractmethod
     def mode(self) -> str:
         """What it does, in its own words."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def armed(self) -> bool:
         """Whether its motors run."""
-        raise NotImplementedError
 
+    @abstractmethod
     def receive(self) -> None:
         """Take what has come over the wire."""
-        raise NotImplementedError
 
+    @abstractmethod
     def command(self, sensed: Sensed, dt: float) -> Motion:
         """The motion of the next ``dt`` s."""
-        raise NotImplementedError
 
+    @abstractmethod
     def tell(self) -> None:
         """Send what is due."""
-        raise NotImplementedError
 
     def step(self) -> None:
         """One step: the wire, the controller, the body, the telemetry."""
