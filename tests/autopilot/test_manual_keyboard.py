@@ -1,7 +1,6 @@
 """The keyboard: keys out of bytes, keys that are held without being released, and the terminal as it was."""
 
 import contextlib
-import fcntl
 import os
 import pty
 import signal
@@ -192,7 +191,8 @@ def test_standard_input_that_is_no_terminal_is_refused(tmp_path, monkeypatch):
 
 
 LEADER = """
-    import os, signal, subprocess, sys
+    import fcntl, os, signal, subprocess, sys, termios
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)  # as a shell: it moves the foreground
     job = subprocess.Popen([sys.executable, "-c", sys.argv[1]], process_group=0)
     os.tcsetpgrp(0, job.pid)
@@ -238,7 +238,7 @@ def test_the_terminal_is_given_back_while_stopped_and_after_ctrl_c():
     ours, theirs = pty.openpty()
     leader = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(LEADER), textwrap.dedent(JOB)],
-        stdin=theirs, stdout=theirs, stderr=theirs, preexec_fn=lambda: (os.setsid(), _control(theirs)),
+        stdin=theirs, stdout=theirs, stderr=theirs, start_new_session=True,
     )  # fmt: skip
     try:
         job = int(until_said(ours, "ready").split("job")[1].split()[0])
@@ -262,10 +262,6 @@ def test_the_terminal_is_given_back_while_stopped_and_after_ctrl_c():
         leader.wait()
         os.close(ours)
         os.close(theirs)
-
-
-def _control(fd):
-    fcntl.ioctl(fd, termios.TIOCSCTTY, 0)
 
 
 def test_keys_are_different_and_known():
