@@ -4,6 +4,7 @@ The thread of the flight steps the mission in real time, with the vehicle where 
 of the mission's policy. The mission's time stands still while a phase is planned and while the vehicle takes off.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,9 +15,9 @@ import numpy as np
 from swarmsim.autopilot.control import Control, State, refuse_under_way
 from swarmsim.autopilot.convert import body_of, setpoint_of
 from swarmsim.autopilot.flown import FlownLog
-from swarmsim.autopilot.frames import yaw_of_quaternion
+from swarmsim.autopilot.frames import Geodetic, enu_of_geodetic, yaw_of_quaternion
 from swarmsim.autopilot.guard import Guard
-from swarmsim.autopilot.link import LinkError, Setpoint, Telemetry, VehicleLink
+from swarmsim.autopilot.link import LinkError, Setpoint, Telemetry, Vector, VehicleLink
 from swarmsim.autopilot.manual.helm import Helm
 from swarmsim.autopilot.manual.sticks import Source
 from swarmsim.config.autopilot import Autopilot
@@ -49,7 +50,8 @@ class Flight:
         self.link, self.live, self.settings, self.flies = link, live, settings, flies
         self._tell, self._observer = tell, observer
         rest = live.body()
-        self._rest = tuple(float(v) for v in rest.position_m)
+        x, y, z = (float(v) for v in rest.position_m)
+        self._rest: Vector = (x, y, z)
         guard = Guard(limits=settings.limits, outline_m=outline_m, ground_m=self._rest[2], flies=flies)
         self.control = Control(link, settings, guard, flies, self._stage)
         self.helm = (
@@ -70,7 +72,7 @@ class Flight:
         self._stage("preflight")
         refuse_under_way(self.link)
         self.link.preflight(self._tell, self.settings.ready_s)
-        self.link.align(self._rest)  # type: ignore[arg-type]
+        self.link.align(place_in_mission(self.link.telemetry(), self._rest, self.settings))
         self.live.start()
         self.control.stream.start()
         if self.helm is not None:
@@ -234,4 +236,27 @@ class Flight:
         return body
 
 
-__all__ = ["Flight", "Observer"]
+def place_in_mission(t: Telemetry, start_m: Vector, settings: Autopilot) -> Vector:
+    """Where in the mission's world the vehicle stands: at its start there, or where a stated origin has it.
+
+    Raises `LinkError` where the vehicle tells no place on the Earth, or stands too far from its start.
+    """
+    if settings.origin is None:
+        return start_m
+    if t.place is None:
+        raise LinkError(
+            "the mission states where its origin lies (autopilot.origin), but the vehicle tells no place on the Earth: "
+            "wait for its receiver, or set autopilot.origin to null to take its place for its start in the mission"
+        )
+    east, north, _ = enu_of_geodetic(t.place, Geodetic(**settings.origin.model_dump()))
+    apart = math.hypot(east - start_m[0], north - start_m[1])
+    if apart > settings.start_m:
+        raise LinkError(
+            f"the vehicle stands {apart:.1f} m from its start in the mission, {east - start_m[0]:+.1f} m east and "
+            f"{north - start_m[1]:+.1f} m north of it (autopilot.start_m is {settings.start_m:g}): carry it there, or "
+            "change position_m of the vehicle or autopilot.origin"
+        )
+    return float(east), float(north), start_m[2]
+
+
+__all__ = ["Flight", "Observer", "place_in_mission"]

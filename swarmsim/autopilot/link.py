@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
+from swarmsim.autopilot.frames import Geodetic
+
 Vector = tuple[float, float, float]
 
 
@@ -63,6 +65,7 @@ class Telemetry:
     estimate_ok: bool | None = None  # its state estimate can be flown on
     ready_to_arm: bool | None = None
     failsafe: bool = False  # it acts by itself: a failsafe is active
+    place: Geodetic | None = None  # on the Earth, WGS-84, altitude above mean sea level
     gnss_fix: int | None = None  # as GPS_RAW_INT.fix_type: 3 for 3D, 5 and 6 for RTK
 
 

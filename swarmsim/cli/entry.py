@@ -17,7 +17,7 @@ EXIT_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which batch systems send: a run is stopped as by Ctrl-C."""
+    """SIGTERM, which batch systems send, or SIGHUP of a terminal that closes: a run is stopped as by Ctrl-C."""
 
 
 def _terminate(number: int, frame: object) -> None:
@@ -33,6 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(line_buffering=True)  # so that a file or a pipe shows how far a run is
     if arguments is None:
         signal.signal(signal.SIGTERM, _terminate)
+        hang_up = getattr(signal, "SIGHUP", None)  # a terminal that is closed; nohup has it ignored
+        if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
+            signal.signal(hang_up, _terminate)
     atexit.register(gc.freeze)  # the interpreter's last collection of garbage would take another second
     try:
         os.getcwd()

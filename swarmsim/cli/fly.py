@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from swarmsim.autopilot.link import VehicleLink
     from swarmsim.autopilot.manual.status import StatusLine
     from swarmsim.autopilot.manual.sticks import Source
+    from swarmsim.config.autopilot import Autopilot
     from swarmsim.config.scenario import Scenario
     from swarmsim.runtime.live import LiveMission
     from swarmsim.runtime.simulation import Simulation
@@ -181,7 +182,6 @@ def _flown(
     force: bool, viewer: str | None, console: Console, pilot: "Source | None",
 ) -> int:  # fmt: skip
     from swarmsim.atomic_folder import claimed
-    from swarmsim.autopilot.control import refuse_under_way
     from swarmsim.autopilot.flight import Flight
     from swarmsim.autopilot.guard import outline_of
     from swarmsim.autopilot.link import LinkError
@@ -207,21 +207,13 @@ def _flown(
         view: LiveView | None = None
         code = EXIT_FLIGHT
         try:
-            known = vehicle.identity
-            screen.tell(f"{known.autopilot} {known.vehicle} {known.version}, system {known.system}")
-            flies = _flies(live)
-            if (known.vehicle == "rover") == flies:
-                raise InputError.of(
-                    "the vehicle of the mission and that on the link are of different kinds",
-                    given=f"{name} {'flies' if flies else 'drives'}, the link has a {known.vehicle}",
-                )
-            refuse_under_way(vehicle)
+            settings = _settings_for(vehicle, live, scenario, name, screen)
             _prepared(live, console)
             outline = outline_of(simulation.site_model.site)
             if viewer is not None:
                 view = LiveView(simulation, live, name, viewer)
             observer = None if view is None else view.observe
-            flight = Flight(vehicle, live, scenario.mission.autopilot, outline, flies, screen.tell, observer, pilot)
+            flight = Flight(vehicle, live, settings, outline, _flies(live), screen.tell, observer, pilot)
             vehicle.on_mode(flight.on_telemetry)
             # a collection of the garbage among all that was compiled would stop the stream for half a second
             gc.collect()
@@ -241,6 +233,25 @@ def _flown(
     if stopped is not None:
         raise stopped
     return code
+
+
+def _settings_for(
+    vehicle: "VehicleLink", live: "LiveMission", scenario: "Scenario", name: str, screen: "StatusLine"
+) -> "Autopilot":
+    """How the vehicle on the link is flown. Raises where it is of another kind than the mission's, or under way."""
+    from swarmsim.autopilot.control import refuse_under_way
+
+    known, flies = vehicle.identity, _flies(live)
+    screen.tell(f"{known.autopilot} {known.vehicle} {known.version}, system {known.system}")
+    if (known.vehicle == "rover") == flies:
+        raise InputError.of(
+            "the vehicle of the mission and that on the link are of different kinds",
+            given=f"{name} {'flies' if flies else 'drives'}, the link has a {known.vehicle}",
+        )
+    refuse_under_way(vehicle)
+    settings = scenario.mission.autopilot
+    # a simulated vehicle has no receiver: it stands where the mission has it
+    return settings.model_copy(update={"origin": None}) if known.autopilot == "sim" else settings
 
 
 def _outcome(flight: Any, screen: "StatusLine") -> tuple[int, KeyboardInterrupt | None]:

@@ -54,11 +54,13 @@ class Autopilot(Model):
     ``at_end``: what it does when its part of the mission has ended in the air, and on Ctrl-C. When the operator changes
     its mode we stop commanding at once, for good.
 
-    With ``origin`` the vehicle's place in the mission is where its receiver says; without it the place where the
-    vehicle stands before the flight is taken for its start in the mission.
+    With ``origin`` the vehicle's place in the mission is where its receiver says, which must be within ``start_m`` of
+    its start there; without it the place where the vehicle stands before the flight is taken for its start. Heights
+    always count from where it stands.
     """
 
     origin: Origin | None = None
+    start_m: Gap = 3.0
     stream_hz: float = Field(default=20.0, ge=5, le=100)
     take_off_m: float = Field(default=3.0, ge=0.5, le=100)
     at_end: Literal["land", "hold", "return"] = "land"

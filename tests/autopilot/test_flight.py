@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 import swarmsim
-from swarmsim.autopilot.flight import Flight
+from swarmsim.autopilot.flight import Flight, place_in_mission
 from swarmsim.autopilot.flown import report
-from swarmsim.autopilot.link import LinkError, Mode
-from swarmsim.config.autopilot import Autopilot, Watchdogs
+from swarmsim.autopilot.frames import Geodetic, geodetic_of_enu
+from swarmsim.autopilot.link import LinkError, Mode, Telemetry
+from swarmsim.config.autopilot import Autopilot, Origin, Watchdogs
 from swarmsim.runtime.live import LiveMission
 from tests.autopilot.fake_link import FakeLink
 
@@ -278,3 +279,23 @@ def test_a_refused_setpoint_ends_the_flight(live):
     assert "limits.speed_m_s" in flight.log.ended
     assert link.asked[-1] == "land"
     assert not link.armed
+
+
+HERE = Geodetic(47.397742, 8.545594, 488.0)
+
+
+def stated(**changes):
+    origin = Origin(latitude_deg=HERE.latitude_deg, longitude_deg=HERE.longitude_deg, altitude_m=HERE.altitude_m)
+    return QUICK.model_copy(update={"origin": origin} | changes)
+
+
+def test_a_stated_origin_says_where_the_vehicle_stands():
+    start = (-74.0, -42.0, 1.0)
+    there = geodetic_of_enu((-73.0, -43.0, 12.0), HERE)
+    place = place_in_mission(Telemetry(place=there), start, stated())
+    assert place == pytest.approx((-73.0, -43.0, 1.0), abs=1e-3)  # the height is that of its start
+    assert place_in_mission(Telemetry(place=there), start, QUICK) == start
+    with pytest.raises(LinkError, match=r"stands 1\.4 m from its start.*\+1\.0 m east and -1\.0 m north"):
+        place_in_mission(Telemetry(place=there), start, stated(start_m=1.0))
+    with pytest.raises(LinkError, match="no place on the Earth"):
+        place_in_mission(Telemetry(), start, stated())

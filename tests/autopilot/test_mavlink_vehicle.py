@@ -10,6 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from swarmsim.autopilot.link import LinkError, Mode, Setpoint, VehicleLink
 from swarmsim.autopilot.mavlink import MavlinkVehicle
+from swarmsim.autopilot.mavlink.decode import Heard, hear, telemetry_of
+from swarmsim.autopilot.mavlink.profile import detect_profile
 from swarmsim.autopilot.mavlink.vehicle import moves
 from swarmsim.config.errors import InputError
 from tests.autopilot import test_mavlink_peer as peers
@@ -322,3 +324,12 @@ def test_a_state_from_before_the_link_was_lost_confirms_nothing(linked):
     peer.close()
     with pytest.raises(LinkError, match="did not hold"):
         vehicle.enter(Mode.HOLD, 0.3)  # its last heartbeat said HOLD
+
+
+def test_its_place_on_the_earth_is_told_from_the_first_fix_on():
+    profile = detect_profile(12, 2)
+    nothing = mavlink.MAVLink_global_position_int_message(1000, 0, 0, 488_000, 0, 0, 0, 0, 0)
+    assert hear(Heard(), nothing, profile, 0.0).place is None
+    fix = mavlink.MAVLink_global_position_int_message(1000, 473977420, 85455940, 488_250, 0, 0, 0, 0, 0)
+    place = telemetry_of(hear(Heard(), fix, profile, 0.0), None).place
+    assert (place.latitude_deg, place.longitude_deg, place.altitude_m) == pytest.approx((47.397742, 8.545594, 488.25))

@@ -7,7 +7,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from swarmsim.autopilot.frames import Alignment, enu_of_ned, flu_of_frd, quaternion_enu_of_ned
+from swarmsim.autopilot.frames import Alignment, Geodetic, enu_of_ned, flu_of_frd, quaternion_enu_of_ned
 from swarmsim.autopilot.link import Mode, Telemetry, Vector
 from swarmsim.autopilot.mavlink.profile import Profile
 from swarmsim.autopilot.mavlink.wire import Message
@@ -32,6 +32,7 @@ class Heard:
     pose_s: float | None = None
     position_ned_m: Vector | None = None
     velocity_ned_m_s: Vector | None = None
+    place: Geodetic | None = None
     quaternion_ned: Quaternion | None = None  # w x y z, FRD to NED
     rates_frd_rad_s: Vector | None = None
     custom_mode: int | None = None
@@ -79,11 +80,17 @@ def _local_position(m: Message, now: float, profile: Profile, heard: Heard) -> d
     }
 
 
+def _global_position(m: Message, now: float, profile: Profile, heard: Heard) -> dict[str, Any]:
+    if m.lat == 0 and m.lon == 0:  # so it is told before there is a position
+        return {}
+    return {"place": Geodetic(m.lat * 1e-7, m.lon * 1e-7, m.alt * 1e-3)}
+
+
 def _clock(m: Message, heard: Heard) -> dict[str, Any]:
     """The vehicle's time since it was switched on: where it goes back, it has restarted, and knows no place yet."""
     if heard.boot_ms is None or m.time_boot_ms + _RESTART_MS >= heard.boot_ms:
         return {"boot_ms": m.time_boot_ms}
-    forgotten = {"pose_s": None, "position_ned_m": None, "velocity_ned_m_s": None, "home_s": None}
+    forgotten = {"pose_s": None, "position_ned_m": None, "velocity_ned_m_s": None, "place": None, "home_s": None}
     return {"boot_ms": m.time_boot_ms, "restarts": heard.restarts + 1, **forgotten}
 
 
@@ -143,6 +150,7 @@ def _version(m: Message, now: float, profile: Profile, heard: Heard) -> dict[str
 _READERS: dict[str, Callable[[Message, float, Profile, Heard], dict[str, Any]]] = {
     "HEARTBEAT": _heartbeat,
     "LOCAL_POSITION_NED": _local_position,
+    "GLOBAL_POSITION_INT": _global_position,
     "ATTITUDE_QUATERNION": _attitude,
     "SYS_STATUS": _sys_status,
     "BATTERY_STATUS": _battery,
@@ -181,6 +189,7 @@ def telemetry_of(heard: Heard, alignment: Alignment | None) -> Telemetry:
         estimate_ok=heard.estimate_ok,
         ready_to_arm=heard.ready_to_arm,
         failsafe=heard.failsafe,
+        place=heard.place,
         gnss_fix=heard.gnss_fix,
     )
 
