@@ -42,7 +42,7 @@ class Control:
 
     def __init__(self, link: VehicleLink, settings: Autopilot, guard: Guard, flies: bool, stage: Callable[[str], None]):
         """``stage`` is told what begins, in a word or a sentence."""
-        self.link, self.settings, self.flies = link, settings, flies
+        self.link, self.settings, self.flies, self._guard = link, settings, flies, guard
         self.state = State.STANDS
         self.alarm: Alarm | None = None
         self.takeover_s: tuple[float, float] | None = None  # when an operator's was seen, and when the stream halted
@@ -90,9 +90,12 @@ class Control:
     def start(self, above_m: Vector, yaw_rad: float) -> bool:
         """Arm it, have it take off to ``above_m`` and follow our setpoints; whether it does: else see ``alarm``."""
         s, link = self.settings, self.link
-        self.state, height = State.STARTS, s.take_off_m
+        height = s.take_off_m
         above = Setpoint(position_m=above_m, velocity_m_s=(0.0, 0.0, 0.0), yaw_rad=yaw_rad)
         waiting = above if self.flies else hold_at(link.telemetry(), flies=False)
+        if not self._may_start(waiting):
+            return False
+        self.state = State.STARTS
         if link.streams_first:
             self.stream.resume()
             self.offer(waiting, keep=True)
@@ -102,7 +105,7 @@ class Control:
         self._mode = Mode.FOLLOW
         link.arm(s.answer_s)
         self._armed = True
-        if self.flies:
+        if self.flies and self.watch():  # an operator may have taken over while it armed
             self._stage("take off")
             if not link.streams_first:
                 link.take_off(height, s.take_off_s)
@@ -114,6 +117,20 @@ class Control:
         if self.watch():
             self.state = State.FOLLOWS
         return self.state is State.FOLLOWS
+
+    def _may_start(self, waiting: Setpoint) -> bool:
+        """Whether it may be armed: nothing is wrong, nobody else has armed it, it may be where it is to wait."""
+        if self.alarm is not None:
+            return False
+        if self.link.telemetry().armed:
+            self._released("somebody else has armed the vehicle, and flies it: nothing is asked of it")
+            return False
+        self.stream.halt()
+        self._guard.forget()
+        self.offer(waiting)  # refused now rather than in the air; nothing is sent while the stream is halted
+        if self.alarm is not None:
+            self._stage(self.alarm.reason)
+        return self.alarm is None
 
     def _climb(self, height_m: float, ground_m: float, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s

@@ -1,0 +1,61 @@
+"""Control of a vehicle when something goes wrong at the worst moment, without a mission and without dynamics."""
+
+import numpy as np
+import pytest
+
+from swarmsim.autopilot.control import Control, State
+from swarmsim.autopilot.guard import Guard
+from swarmsim.autopilot.link import Mode
+from swarmsim.config.autopilot import Autopilot, SetpointLimits, Watchdogs
+from tests.autopilot.fake_link import FakeLink
+
+QUICK = Autopilot(
+    take_off_m=2.0, answer_s=1.0, take_off_s=10.0, land_s=20.0, watchdogs=Watchdogs(stale_s=0.5, hold_s=0.1)
+)
+OUTLINE_M = np.array([[-100.0, -100.0], [100.0, -100.0], [100.0, 100.0], [-100.0, 100.0]])
+ABOVE_M = (0.0, 0.0, 2.0)
+
+
+@pytest.fixture
+def link():
+    made = FakeLink(streams_first=False)
+    yield made
+    made.close()
+
+
+def controlled(link, settings=QUICK):
+    guard = Guard(limits=settings.limits, outline_m=OUTLINE_M, ground_m=0.0, flies=True)
+    control = Control(link, settings, guard, link.flies, lambda _: None)
+    link.on_mode(control.on_telemetry)
+    control.stream.start()
+    return control
+
+
+def test_a_vehicle_that_somebody_else_has_armed_is_left_to_him(link):
+    control = controlled(link)
+    link.armed, link.mode, link.place = True, Mode.OTHER, np.array([0.0, 0.0, 20.0])
+    assert not control.start((0.0, 0.0, 22.0), 0.0)
+    assert link.asked == [] and control.state is State.RELEASED and control.alarm.takeover
+
+
+def test_an_operator_who_takes_over_as_it_arms_is_not_overruled(link, monkeypatch):
+    control = controlled(link)
+    monkeypatch.setattr(link, "arm", lambda timeout_s: link.change(Mode.OTHER, armed=True))
+    assert not control.start(ABOVE_M, 0.0)
+    assert "take_off" not in link.asked and control.state is State.RELEASED
+
+
+@pytest.mark.parametrize(
+    ("east_m", "ceiling_m", "reason"), [(150.0, 120.0, "outline"), (0.0, 1.0, "height")], ids=["outside", "too high"]
+)
+def test_what_may_not_be_sent_in_the_air_keeps_it_on_the_ground(link, east_m, ceiling_m, reason):
+    control = controlled(link, QUICK.model_copy(update={"limits": SetpointLimits(ceiling_m=ceiling_m)}))
+    assert not control.start((east_m, 0.0, 2.0), 0.0)
+    assert link.asked == [] and control.state is State.STANDS and reason in control.alarm.reason
+
+
+def test_a_vehicle_with_an_alarm_does_not_take_off_again(link):
+    control = controlled(link)
+    control.failed("something broke while it landed")
+    assert not control.start(ABOVE_M, 0.0)
+    assert link.asked == [] and not link.armed
