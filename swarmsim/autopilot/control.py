@@ -22,6 +22,7 @@ STREAMED_S = 1.5  # of setpoints before a vehicle that asks for them is told to 
 CLIMBED = 0.85  # of the height of take-off, from which on the mission flies it
 RESTS_M_S, RESTS_S = 0.1, 3.0  # a rover on its way home has arrived when it has been that slow for so long
 POLL_S = 0.05
+ASK_AGAIN_S = 1.0  # in an emergency, where the vehicle says that it still follows
 
 _MODES = {"land": Mode.LAND, "hold": Mode.HOLD, "return": Mode.RETURN}
 
@@ -207,14 +208,25 @@ class Control:
             time.sleep(POLL_S)
 
     def emergency(self) -> None:
-        """Something failed: in the air, ask for what the settings say without waiting for an answer."""
+        """Something failed: in the air, ask for what the settings say until it does that, or somebody else flies it."""
+        ours = {Mode.FOLLOW}
+        if self._mode is Mode.HOLD and self.state in (State.STARTS, State.FOLLOWS):
+            ours.add(Mode.HOLD)  # it was to hold for a while only
         self._mode = None
         self.stream.halt()
-        t = self.link.telemetry()
-        if t.armed and t.mode is Mode.FOLLOW:
-            how = self.settings.watchdogs.then
-            self._stage(f"asking for {how} because of that")
-            self.link.request(_MODES[how])
+        how = self.settings.watchdogs.then
+        end, asked_s, heard_s = time.monotonic() + self.settings.land_s, None, None
+        while (t := self.link.telemetry()).armed and t.mode in ours:
+            now = time.monotonic()
+            if asked_s is None:
+                self._stage(f"asking for {how} because of that")
+            if asked_s is None or (now - asked_s > ASK_AGAIN_S and t.heard_s != heard_s):  # it has said so since
+                self.link.request(_MODES[how])
+                asked_s, heard_s = now, t.heard_s
+            if now > end:
+                self._stage(f"it has not told for {self.settings.land_s:g} s that it does: its own failsafe has to act")
+                return
+            time.sleep(POLL_S)
 
     # Inside
 
@@ -251,8 +263,8 @@ class Control:
 
     def _enter(self, mode: Mode) -> None:
         """Change the mode, unless the one that it is in is neither of ours: that is a takeover."""
-        now = self.link.telemetry()
-        ours = {Mode.FOLLOW, Mode.TAKEOFF, self._mode, mode}
+        now, before = self.link.telemetry(), self._mode
+        ours = {Mode.FOLLOW, Mode.TAKEOFF, before, mode}
         self._mode = None  # the change that comes is ours
         if self.state is State.FOLLOWS and self.alarm is None:
             self.hold()  # until the mode has changed
@@ -262,6 +274,9 @@ class Control:
         try:
             self.link.enter(mode, self.settings.answer_s)
             self._mode = mode
+        except BaseException:  # it holds as we had asked, until somebody asks for something else
+            self._mode = before if before is Mode.HOLD else None
+            raise
         finally:
             self.stream.halt()
 

@@ -99,6 +99,9 @@ class Flight:
         except LinkError as error:
             self._tell(str(error))
             self.control.emergency()
+        except BaseException:  # stopped once more, perhaps before the vehicle had done what it was asked for
+            self.control.emergency()
+            raise
 
     def _stage(self, name: str) -> None:
         self._tell(name)

@@ -5,7 +5,8 @@ import pytest
 
 from swarmsim.autopilot.control import Control, State
 from swarmsim.autopilot.guard import Guard
-from swarmsim.autopilot.link import Mode
+from swarmsim.autopilot.link import LinkError, Mode
+from swarmsim.autopilot.watch import Action, Alarm
 from swarmsim.config.autopilot import Autopilot, SetpointLimits, Watchdogs
 from tests.autopilot.fake_link import FakeLink
 
@@ -35,14 +36,17 @@ def test_a_vehicle_that_somebody_else_has_armed_is_left_to_him(link):
     control = controlled(link)
     link.armed, link.mode, link.place = True, Mode.OTHER, np.array([0.0, 0.0, 20.0])
     assert not control.start((0.0, 0.0, 22.0), 0.0)
-    assert link.asked == [] and control.state is State.RELEASED and control.alarm.takeover
+    assert link.asked == []
+    assert control.state is State.RELEASED
+    assert control.alarm.takeover
 
 
 def test_an_operator_who_takes_over_as_it_arms_is_not_overruled(link, monkeypatch):
     control = controlled(link)
     monkeypatch.setattr(link, "arm", lambda timeout_s: link.change(Mode.OTHER, armed=True))
     assert not control.start(ABOVE_M, 0.0)
-    assert "take_off" not in link.asked and control.state is State.RELEASED
+    assert "take_off" not in link.asked
+    assert control.state is State.RELEASED
 
 
 @pytest.mark.parametrize(
@@ -51,11 +55,67 @@ def test_an_operator_who_takes_over_as_it_arms_is_not_overruled(link, monkeypatc
 def test_what_may_not_be_sent_in_the_air_keeps_it_on_the_ground(link, east_m, ceiling_m, reason):
     control = controlled(link, QUICK.model_copy(update={"limits": SetpointLimits(ceiling_m=ceiling_m)}))
     assert not control.start((east_m, 0.0, 2.0), 0.0)
-    assert link.asked == [] and control.state is State.STANDS and reason in control.alarm.reason
+    assert link.asked == []
+    assert control.state is State.STANDS
+    assert reason in control.alarm.reason
 
 
 def test_a_vehicle_with_an_alarm_does_not_take_off_again(link):
     control = controlled(link)
     control.failed("something broke while it landed")
     assert not control.start(ABOVE_M, 0.0)
-    assert link.asked == [] and not link.armed
+    assert link.asked == []
+    assert not link.armed
+
+
+def test_a_landing_that_is_not_heard_of_is_asked_for_again(link, monkeypatch):
+    control = controlled(link)
+    assert control.start(ABOVE_M, 0.0)
+    told = FakeLink.request
+    lost = iter([True, False])
+    monkeypatch.setattr(link, "request", lambda mode: None if next(lost) else told(link, mode))
+    control.emergency()
+    assert link.mode is Mode.LAND
+
+
+def test_an_operator_who_takes_over_in_an_emergency_is_not_overruled(link, monkeypatch):
+    control = controlled(link)
+    assert control.start(ABOVE_M, 0.0)
+    asked = []
+    monkeypatch.setattr(link, "request", lambda mode: (asked.append(mode), link.change(Mode.OTHER)))
+    control.emergency()
+    assert asked == [Mode.LAND]
+    assert link.mode is Mode.OTHER
+
+
+def test_a_vehicle_that_is_silent_is_asked_once_and_given_up(link, monkeypatch):
+    control = controlled(link, QUICK.model_copy(update={"land_s": 1.5}))
+    assert control.start(ABOVE_M, 0.0)
+    link.heard = False
+    asked = []
+    monkeypatch.setattr(link, "request", asked.append)
+    control.emergency()
+    assert asked == [Mode.LAND]
+
+
+@pytest.mark.parametrize("stops", [LinkError("it was refused"), KeyboardInterrupt()], ids=["refused", "stopped"])
+def test_a_vehicle_that_was_to_hold_for_a_while_is_not_left_in_the_air(link, monkeypatch, stops):
+    control = controlled(link)
+    assert control.start(ABOVE_M, 0.0)
+
+    def enter(mode, timeout_s):
+        if mode is Mode.LAND:
+            raise stops
+        link.change(mode)
+
+    monkeypatch.setattr(link, "enter", enter)
+    control.alarm = Alarm(Action.HOLD, "this computer is too slow")
+    with pytest.raises(type(stops)):
+        control.watch()
+    assert link.mode is Mode.HOLD
+    monkeypatch.undo()
+    if isinstance(stops, KeyboardInterrupt):
+        control.stop()
+    else:
+        control.emergency()
+    assert link.mode is Mode.LAND

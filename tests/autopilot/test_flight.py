@@ -299,3 +299,20 @@ def test_a_stated_origin_says_where_the_vehicle_stands():
         place_in_mission(Telemetry(place=there), start, stated(start_m=1.0))
     with pytest.raises(LinkError, match="no place on the Earth"):
         place_in_mission(Telemetry(), start, stated())
+
+
+def test_stopping_twice_does_not_leave_the_vehicle_in_the_air(live, monkeypatch):
+    link = FakeLink()
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    def user(flight, link):
+        reached(flight, link)
+        monkeypatch.setattr(link, "enter", stop)  # while it is asked to land
+        monkeypatch.setattr(flight.live, "step", stop)
+
+    with pytest.raises(KeyboardInterrupt):
+        flown(live, link, during=user)
+    assert link.asked[-1] == "request land"
+    assert link.mode is Mode.LAND
