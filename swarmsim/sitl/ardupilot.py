@@ -73,6 +73,8 @@ class ArdupilotLink:
                 continue
             if self._take(data, asker):
                 return True
+            if time.monotonic() > end:  # others send without end
+                return False
 
     def _take(self, data: bytes, asker: tuple[str, int]) -> bool:
         """Whether this is a new request."""

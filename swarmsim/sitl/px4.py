@@ -7,6 +7,7 @@ import contextlib
 import math
 import select
 import socket
+import time
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -87,8 +88,9 @@ class Px4Link:
     def hear(self, timeout_s: float) -> bool:
         """Wait for the HIL_ACTUATOR_CONTROLS of the time that was told last."""
         assert self._wire is not None
+        end = time.monotonic() + timeout_s
         while True:
-            ready, _, _ = select.select([self._wire], [], [], timeout_s)
+            ready, _, _ = select.select([self._wire], [], [], max(0.0, end - time.monotonic()))
             if not ready:
                 return False
             try:
@@ -99,6 +101,8 @@ class Px4Link:
                 raise self._ended()
             if self._take(self._protocol.messages_of(data, datagram=False)[0]):
                 return True
+            if time.monotonic() > end:  # it talks without end, and does not answer
+                return False
 
     def _take(self, messages: list[Message]) -> bool:
         """Whether the answer was among them; an earlier one is taken over too, but it is none to what was told last."""

@@ -2,6 +2,8 @@
 
 import math
 import socket
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -184,3 +186,28 @@ def test_hostile_packets_are_no_requests(packets):
         assert np.all(np.abs(link.actuators) <= 1.0)
     finally:
         link.close()
+
+
+@pytest.mark.parametrize(("kind", "link"), [("px4", Px4Link), ("ardupilot", ArdupilotLink)])
+def test_one_that_talks_without_end_and_does_not_answer_is_not_waited_for(kind, link):
+    stream = socket.SOCK_STREAM if kind == "px4" else socket.SOCK_DGRAM
+    port = free_port(stream)
+    made = link(SEAT, load_sitl_settings(kind).model_copy(update={"port": port}))
+    peer, end = socket.socket(socket.AF_INET, stream), time.monotonic() + 3.0
+    peer.connect(("127.0.0.1", port))
+
+    def talk():
+        while time.monotonic() < end:
+            peer.send(b"no message")
+            time.sleep(0.001)
+
+    talker = threading.Thread(target=talk)
+    talker.start()
+    try:
+        made.connected()
+        assert not made.hear(0.1)
+        assert time.monotonic() < end
+    finally:
+        talker.join()
+        peer.close()
+        made.close()
