@@ -38,7 +38,7 @@ app = App(
         "    swarmsim list vehicles       what there is to build a team of\n\n"
         "'swarmsim COMMAND --help' says more of a command, with examples.\n"
         "Exit codes: 0 done, 2 wrong input (told on standard error), 3 a doubtful answer of 'run --strict',\n"
-        "4 a flight that did not end as planned, 130 stopped with Ctrl-C, 143 by SIGTERM,\n"
+        "4 a flight that did not end as planned, 130 stopped with Ctrl-C, 143 by SIGTERM, 129 by SIGHUP,\n"
         "136 a stand-in autopilot that died as the real one would."
     ),
     version=_version,

@@ -1,6 +1,7 @@
 """The command line as a process: exit codes, and what is told of errors and of Ctrl-C."""
 
 import atexit
+import contextlib
 import gc
 import io
 import os
@@ -13,15 +14,36 @@ from cyclopts import CycloptsError
 from swarmsim.cli.commands import app
 from swarmsim.config.errors import InputError
 
-EXIT_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 130, 143
+EXIT_INPUT, EXIT_HUNG_UP, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 129, 130, 143
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which batch systems send, or SIGHUP of a terminal that closes: a run is stopped as by Ctrl-C."""
+    """SIGTERM, which batch systems send: a run is stopped as by Ctrl-C."""
+
+
+class HungUp(KeyboardInterrupt):
+    """SIGHUP: the terminal was closed, or its connection lost. A vehicle in flight must not be left alone by it."""
 
 
 def _terminate(number: int, frame: object) -> None:
     raise Terminated
+
+
+def _hang_up(number: int, frame: object) -> None:
+    raise HungUp
+
+
+def _handle_signals() -> None:
+    signal.signal(signal.SIGTERM, _terminate)
+    hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
+    if hang_up is not None and signal.getsignal(hang_up) is signal.SIG_DFL:  # nohup has it ignored
+        signal.signal(hang_up, _hang_up)
+
+
+def _told(text: str) -> None:
+    with contextlib.suppress(OSError):  # the terminal has gone
+        sys.stderr.write(text)
+        sys.stderr.flush()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,10 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # so that a file or a pipe shows how far a run is
     if arguments is None:
-        signal.signal(signal.SIGTERM, _terminate)
-        hang_up = getattr(signal, "SIGHUP", None)  # a terminal that is closed; nohup has it ignored
-        if hang_up is not None and signal.getsignal(hang_up) is not signal.SIG_IGN:
-            signal.signal(hang_up, _terminate)
+        _handle_signals()
     atexit.register(gc.freeze)  # the interpreter's last collection of garbage would take another second
     try:
         os.getcwd()
@@ -59,13 +78,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt as stop:
-        code = EXIT_TERMINATED if isinstance(stop, Terminated) else EXIT_INTERRUPTED
-        by = "by SIGTERM" if isinstance(stop, Terminated) else "with Ctrl-C"
-        sys.stderr.write(f"\nstopped {by}: nothing unfinished was left behind\n")
+        code, by = EXIT_INTERRUPTED, "with Ctrl-C"
+        if isinstance(stop, Terminated):
+            code, by = EXIT_TERMINATED, "by SIGTERM"
+        elif isinstance(stop, HungUp):
+            code, by = EXIT_HUNG_UP, "by SIGHUP"
+        _told(f"\nstopped {by}: nothing unfinished was left behind\n")
         if arguments is None:
             # the interpreter would wait for what another thread still compiles or computes, which can take minutes
-            sys.stdout.flush()
-            sys.stderr.flush()
+            with contextlib.suppress(OSError):
+                sys.stdout.flush()
             os._exit(code)
         return code
     return 0

@@ -94,7 +94,11 @@ def test_the_help_is_quick_and_says_what_there_is() -> None:
 
 @pytest.mark.parametrize(
     ("sent", "code", "told"),
-    [(signal.SIGINT, 130, "stopped with Ctrl-C"), (signal.SIGTERM, 143, "stopped by SIGTERM")],
+    [
+        (signal.SIGINT, 130, "stopped with Ctrl-C"),
+        (signal.SIGTERM, 143, "stopped by SIGTERM"),
+        (signal.SIGHUP, 129, "stopped by SIGHUP"),
+    ],
 )
 def test_a_run_is_stopped_at_once_whatever_another_thread_does(sent: int, code: int, told: str, tmp_path: Path) -> None:
     """The main thread waits for one that does not end; what the command wrote for itself is taken away."""
