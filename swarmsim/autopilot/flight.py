@@ -166,6 +166,7 @@ class Flight:
         """Offer the policy's setpoint, or end the vehicle's part where the mission is done with it."""
         control = self.control
         if self._flown_by_hand(step, t):
+            self._waits = False  # handed back between phases it has to hold anew
             return None if self.helm is None else self.helm.setpoint
         if not step.in_phase:
             if not self._waits:

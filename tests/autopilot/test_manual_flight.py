@@ -2,6 +2,7 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -255,3 +256,22 @@ def test_a_link_that_breaks_while_a_pilot_flies_is_told(uav):
 
     with pytest.raises(LinkError, match="has failed"):
         flown(uav, script)
+
+
+def test_handed_back_between_phases_it_holds_again(uav, monkeypatch):
+    def script(flight, pilot, link):
+        step = uav.step
+        monkeypatch.setattr(uav, "step", lambda *a: replace(step(*a), in_phase=False, begins=(), over=False))
+        monkeypatch.setattr(uav, "has_phase_to_come", lambda: True)
+        begun(flight)
+        until(lambda: flight._waits)
+        pilot.ask(Event.TAKE_OVER)
+        until(lambda: flight.helm.setpoint is not None)
+        pilot.ask(Event.TAKE_OVER)
+        until(lambda: not flight.helm.flies)
+        time.sleep(3.0 * QUICK.watchdogs.stale_s)
+        assert flight.control.alarm is None
+        monkeypatch.setattr(uav, "has_phase_to_come", lambda: False)
+
+    flight, _ = flown(uav, script)
+    assert flight.log.ended == ""
