@@ -293,6 +293,10 @@ class Control:
         if self._mode is Mode.FOLLOW:
             stale = self.settings.watchdogs.stale_s
             self._raise(Alarm(Action.HOLD, f"the mission gave no setpoint for {stale:g} s: this computer is too slow"))
+            if self.link.telemetry().mode is Mode.FOLLOW:  # who should act on it may be stuck: it is asked to hold here
+                self._mode = Mode.HOLD
+                self.stream.halt()
+                self.link.request(Mode.HOLD)
 
     def _on_error(self, error: Exception) -> None:
         self.failed(f"a setpoint could not be sent: {error}")

@@ -47,6 +47,8 @@ class Watch:
                 Action.END,
                 f"{since}, the last heartbeat {silent:.1f} s ago: check the link, the GNSS receiver and the estimate",
             )
+        if t.position_m is None:
+            return Alarm(Action.END, "its place is not known: the autopilot has restarted, with another origin")
         if t.estimate_ok is False:
             return Alarm(Action.END, "the autopilot's state estimate has failed")
         if t.battery is not None and t.battery < self.limits.battery:

@@ -1,12 +1,15 @@
 """Control of a vehicle when something goes wrong at the worst moment, without a mission and without dynamics."""
 
+import time
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from swarmsim.autopilot.control import Control, State
 from swarmsim.autopilot.guard import Guard
-from swarmsim.autopilot.link import LinkError, Mode
-from swarmsim.autopilot.watch import Action, Alarm
+from swarmsim.autopilot.link import LinkError, Mode, Setpoint, Telemetry
+from swarmsim.autopilot.watch import Action, Alarm, Watch
 from swarmsim.config.autopilot import Autopilot, SetpointLimits, Watchdogs
 from tests.autopilot.fake_link import FakeLink
 
@@ -119,3 +122,28 @@ def test_a_vehicle_that_was_to_hold_for_a_while_is_not_left_in_the_air(link, mon
     else:
         control.emergency()
     assert link.mode is Mode.LAND
+
+
+def test_a_vehicle_holds_though_the_thread_of_the_flight_is_stuck(link):
+    control = controlled(link)
+    assert control.start(ABOVE_M, 0.0)
+    control.offer(Setpoint(position_m=(0.5, 0.0, 2.0)))
+    deadline = time.monotonic() + 10.0
+    while link.mode is not Mode.HOLD:  # nobody calls `watch` meanwhile
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    sent = len(link.sent)
+    control.offer(Setpoint(position_m=(1.0, 0.0, 2.0)))
+    time.sleep(0.2)
+    assert len(link.sent) == sent
+    assert "too slow" in control.alarm.reason
+    control.stop()
+    assert link.mode is Mode.LAND
+
+
+def test_a_vehicle_whose_origin_is_another_is_not_flown_on():
+    now = time.monotonic()
+    t = Telemetry(heard_s=now, pose_s=now, position_m=(0.0, 0.0, 2.0), armed=True, mode=Mode.FOLLOW)
+    watch = Watch(Watchdogs())
+    assert watch.check(t, now) is None
+    assert watch.check(replace(t, position_m=None), now).action is Action.END

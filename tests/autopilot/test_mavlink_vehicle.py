@@ -145,7 +145,12 @@ def test_a_restart_voids_the_alignment(linked, deaf):
     assert eventually(lambda: any("restarted" in text for text in vehicle.messages()))
     with pytest.raises(LinkError, match="align"):
         vehicle.send(Setpoint((1.0, 2.0, 3.0)))
-    assert deaf == set() or vehicle.telemetry().position_m is None
+    time.sleep(0.2)
+    assert vehicle.telemetry().position_m is None  # of a new origin it would be another place
+    peer.deaf = set()
+    assert eventually(lambda: vehicle._heard.position_ned_m is not None)
+    vehicle.align((100.0, 50.0, 5.0))
+    assert vehicle.telemetry().position_m == pytest.approx((100.0, 50.0, 5.0))
 
 
 def test_setpoints_arrive(linked):

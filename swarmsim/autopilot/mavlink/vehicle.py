@@ -72,6 +72,7 @@ class MavlinkVehicle:
         self._changed = threading.Condition()
         self._heard = Heard()
         self._alignment: Alignment | None = None
+        self._astray = False  # it was aligned, and has restarted: nobody knows where its new origin lies
         self._telemetry = Telemetry()
         self._begin_s = time.monotonic()
         self._listeners: list[Callable[[Telemetry], None]] = []
@@ -101,7 +102,10 @@ class MavlinkVehicle:
     # what it tells
 
     def telemetry(self) -> Telemetry:
-        """The latest snapshot, in the world once aligned; any thread may ask."""
+        """The latest snapshot, in the world once aligned; any thread may ask.
+
+        After a restart that voids the alignment there is no position in it until the vehicle is aligned again.
+        """
         return self._telemetry
 
     @property
@@ -127,7 +131,7 @@ class MavlinkVehicle:
             if local is None or self._heard.pose_s is None or time.monotonic() - self._heard.pose_s > checks.FRESH_S:
                 raise LinkError("the vehicle tells no position to align: wait for the preflight checks")
             x, y, z = map(float, world_m)
-            self._alignment = Alignment((x, y, z), local)
+            self._alignment, self._astray = Alignment((x, y, z), local), False
             self._telemetry = telemetry_of(self._heard, self._alignment)
 
     # what it is told
@@ -240,10 +244,12 @@ class MavlinkVehicle:
             if after is before:
                 return
             if after.restarts != before.restarts:
+                self._astray = self._astray or self._alignment is not None
                 self._alignment = None
                 self._words.note("the autopilot has restarted: its origin is another, align again", 2)
             self._heard = after
-            self._telemetry = telemetry = telemetry_of(after, self._alignment)
+            telemetry = telemetry_of(after, self._alignment)
+            self._telemetry = telemetry = replace(telemetry, position_m=None) if self._astray else telemetry
         with self._changed:
             self._changed.notify_all()
         state = (after.custom_mode, after.armed, after.failsafe)
