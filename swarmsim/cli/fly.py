@@ -192,7 +192,7 @@ def _flown(
     simulation, live = _built(scenario, name)
     sys.setswitchinterval(SWITCH_S)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    log = folder.parent / f"{folder.name}{log_suffix(link)}"  # whatever happens, what was said stays
+    log = _free(folder.parent / f"{folder.name}{log_suffix(link)}")  # whatever happens, what was said stays
 
     flight: Flight | None = None
     screen = StatusLine(sys.stdout, lambda: "" if flight is None or flight.helm is None else flight.helm.line())
@@ -252,6 +252,15 @@ def _settings_for(
     settings = scenario.mission.autopilot
     # a simulated vehicle has no receiver: it stands where the mission has it
     return settings.model_copy(update={"origin": None}) if known.autopilot == "sim" else settings
+
+
+def _free(log: Path) -> Path:
+    """This file, or one beside it with a number where there is one already: of an earlier flight, or somebody's."""
+    path, number = log, 1
+    while path.exists():
+        number += 1
+        path = log.with_name(f"{log.stem}-{number}{log.suffix}")
+    return path
 
 
 def _outcome(flight: Any, screen: "StatusLine") -> tuple[int, KeyboardInterrupt | None]:

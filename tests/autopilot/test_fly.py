@@ -16,6 +16,7 @@ from swarmsim.autopilot.standin.settings import load_settings
 from swarmsim.autopilot.standin.sockets import open_link
 from swarmsim.autopilot.standin.vehicle import Standin
 from swarmsim.cli.entry import main
+from swarmsim.cli.fly import _free
 from tests.autopilot.ports import free_port
 
 BLOCK = """
@@ -170,3 +171,11 @@ def test_a_vehicle_that_is_armed_is_refused_until_it_was_brought_down(capsys):
         assert "--recover" in capsys.readouterr().err
         assert main([*bench, "--recover", "land"]) == 0
         assert not standin.armed
+
+
+def test_the_log_of_an_earlier_flight_is_not_written_over(tmp_path):
+    log = tmp_path / "recon_uav1.tlog"
+    assert _free(log) == log
+    log.write_bytes(b"why it came down")
+    (tmp_path / "recon_uav1-2.tlog").touch()
+    assert _free(log) == tmp_path / "recon_uav1-3.tlog"
