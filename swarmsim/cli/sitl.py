@@ -122,17 +122,26 @@ def _run(
 def _make(folder: Path, force: bool) -> None:
     """Make the folder; with ``force`` an earlier session's is emptied. Raises `InputError`."""
     from swarmsim.config.errors import file_errors_told
-    from swarmsim.sitl.report import REPORT
 
     with file_errors_told("the folder of the results cannot be used", file=folder):
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            if not force or not (folder / REPORT).is_file():
+            if not force or not _is_session(folder):
                 raise InputError.of(
                     "there is something already", path="--out", given=str(folder),
                     suggestion="choose another folder, or --force to replace an earlier session",
                 )  # fmt: skip
             shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
+
+
+def _is_session(folder: Path) -> bool:
+    """Whether a folder is an earlier session's: with its report, or broken off before there was one."""
+    from swarmsim.sitl.firmware import PRINTED
+    from swarmsim.sitl.report import REPORT
+
+    return folder.is_dir() and (
+        (folder / REPORT).is_file() or all((inside / PRINTED).is_file() for inside in folder.iterdir())
+    )
 
 
 def _link_of(seat: "Seat", settings: "SitlSettings", stack: ExitStack) -> "FirmwareLink":

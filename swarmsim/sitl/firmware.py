@@ -20,6 +20,7 @@ STARTS = {"px4": "SWARMSIM_PX4_SITL", "ardupilot": "SWARMSIM_ARDUPILOT_SITL"}
 ENDS_S = 3.0
 _FRAMES = {4: 1, 6: 2, 8: 3}  # FRAME_CLASS of ArduPilot
 TOLD_LINES = 12
+PRINTED = "firmware.log"  # in each vehicle's folder
 
 
 def parameters_of(autopilot: str, vehicle: Multirotor | SkidSteer) -> dict[str, float]:
@@ -75,7 +76,7 @@ class Firmware:
                 allowed=PLACEHOLDERS + "; other braces are written twice",
             ) from error  # fmt: skip
         named = {f"PX4_PARAM_{name}": f"{value:g}" for name, value in parameters.items()} if autopilot == "px4" else {}
-        self.log = folder / "firmware.log"
+        self.log = folder / PRINTED
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
                 ["/bin/sh", "-c", line],

@@ -14,6 +14,7 @@ import pytest
 
 from swarmsim.autopilot.frames import Geodetic
 from swarmsim.cli.entry import main
+from swarmsim.cli.sitl import _make
 from swarmsim.config.errors import InputError
 from swarmsim.config.load import load_named
 from swarmsim.sitl.firmware import STARTS, Firmware, parameters_of
@@ -144,6 +145,15 @@ def test_an_earlier_session_is_replaced_only_when_asked(folder, capsys):
         assert main(["sitl", "block.yaml", "--autopilot", "px4", "--out", "out", *force]) == 2
         assert "--force" in capsys.readouterr().err
     assert (folder / "out" / "thesis.tex").is_file()
+
+
+def test_a_session_whose_firmware_did_not_start_is_replaced_when_asked(folder):
+    _make(folder / "out", force=False)
+    started("echo broken; exit 1", folder / "out").stop()
+    with pytest.raises(InputError):
+        _make(folder / "out", force=False)
+    _make(folder / "out", force=True)
+    assert list((folder / "out").iterdir()) == []
 
 
 def test_a_session_from_start_to_report(folder, monkeypatch, capsys):
