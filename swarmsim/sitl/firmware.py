@@ -1,5 +1,6 @@
 """Firmware as processes of ours: a start command for each vehicle, and the parameters that suit it."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -103,8 +104,13 @@ class Firmware:
             except ProcessLookupError:
                 break
             end = time.monotonic() + (ENDS_S if number == signal.SIGTERM else 1.0)
-            while self._process.poll() is None and time.monotonic() < end:
-                time.sleep(0.05)
+            try:
+                while self._process.poll() is None and time.monotonic() < end:
+                    time.sleep(0.05)
+            except BaseException:  # Ctrl-C once more: there is no time to end by itself
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(self._process.pid, signal.SIGKILL)
+                raise
         self._process.wait()
 
 

@@ -112,7 +112,7 @@ class Px4Link:
                 continue
             self.armed = bool(message.mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
             outputs = np.asarray(message.controls) if self.armed else np.zeros(len(message.controls))
-            self.actuators = ordered(self.seat, np.nan_to_num(outputs))
+            self.actuators = ordered(self.seat, np.clip(np.nan_to_num(outputs), -1.0, 1.0))
             answered = answered or message.time_usec >= self._told_us
         return answered
 

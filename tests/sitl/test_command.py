@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import signal
 import socket
 import sys
 import threading
@@ -92,6 +93,21 @@ def test_what_a_start_command_started_ends_with_it(folder):
     while os.path.exists(f"/proc/{child}") and "Z" not in state_of(child) and time.monotonic() < deadline:
         time.sleep(0.02)
     assert not os.path.exists(f"/proc/{child}") or "Z" in state_of(child)
+
+
+def test_stopped_twice_nothing_is_left_of_a_firmware_that_does_not_end(folder, monkeypatch):
+    one = started("trap '' TERM; echo up; sleep 60", folder)
+    while "up" not in one.log.read_text(encoding="utf-8"):
+        time.sleep(0.01)
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(time, "sleep", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            one.stop()
+    assert one._process.wait(10.0) == -signal.SIGKILL
 
 
 def state_of(process):
