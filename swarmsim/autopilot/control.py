@@ -82,6 +82,9 @@ class Control:
         if self.state in (State.STARTS, State.FOLLOWS):
             if self._armed:
                 self._raise(self._watch.check(t))
+                where = None if t.position_m is None else self._guard.left(t.position_m)
+                if where is not None:
+                    self._raise(Alarm(Action.END, f"the vehicle is {where}"))
             if self.alarm is not None:
                 self._handle(self.alarm)
         return self.alarm is None

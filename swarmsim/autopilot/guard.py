@@ -52,6 +52,20 @@ class Guard:
             self._last = now_s, setpoint.position_m
         return setpoint
 
+    def left(self, place: Vector) -> str | None:
+        """Where a measured place lies, if that is outside of the volume: velocities alone may lead there.
+
+        Positions that are sent stay ``margin_m`` inside the outline; an overshoot of ``jump_m`` over the ceiling is let
+        pass.
+        """
+        inside = float(np.min(inward_distances(self.outline_m, inward_normals(self.outline_m), place)))
+        if inside < 0.0:
+            return f"{-inside:.1f} m outside the site's outline"
+        above = place[2] - self.ground_m
+        if self.flies and above > self.limits.ceiling_m + self.limits.jump_m:
+            return f"{above:.1f} m above its start, limits.ceiling_m is {self.limits.ceiling_m:g}"
+        return None
+
     def forget(self) -> None:
         """The next position may lie anywhere in the volume: the vehicle has been elsewhere meanwhile."""
         self._last = None

@@ -147,3 +147,16 @@ def test_a_vehicle_whose_origin_is_another_is_not_flown_on():
     watch = Watch(Watchdogs())
     assert watch.check(t, now) is None
     assert watch.check(replace(t, position_m=None), now).action is Action.END
+
+
+@pytest.mark.parametrize(
+    ("place_m", "reason"), [((120.0, 0.0, 2.0), "20.0 m outside"), ((0.0, 0.0, 150.0), "150.0 m above")]
+)
+def test_a_vehicle_that_leaves_the_volume_is_brought_down(link, place_m, reason):
+    control = controlled(link)
+    assert control.start(ABOVE_M, 0.0)
+    assert control.watch()
+    link.place = np.array(place_m)  # as a wind, or velocities without a position, may take it
+    assert not control.watch()
+    assert reason in control.alarm.reason
+    assert link.asked[-1] == "land"
