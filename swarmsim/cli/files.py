@@ -101,28 +101,35 @@ def _check_sensors(vehicle: Any, path: Path) -> None:
 
 
 def _check_autopilot(path: Path) -> str:
-    """Validate what is known of an autopilot, or how one is stood in for; what it is."""
+    """Validate a file of `configs/autopilots`, whose name tells what it is; what that is."""
     from swarmsim.autopilot.ardrone.settings import ArdroneSettings
     from swarmsim.autopilot.mavlink.profile import Autopilot
     from swarmsim.autopilot.pelican.settings import PelicanSettings
+    from swarmsim.autopilot.simulated import SimulatedManners
     from swarmsim.autopilot.standin.ardrone import ArdroneStandinSettings
     from swarmsim.autopilot.standin.pelican import PelicanStandinSettings
     from swarmsim.autopilot.standin.settings import Settings
     from swarmsim.config.load import load_model
+    from swarmsim.config.manual import GamepadMap
     from swarmsim.sitl.settings import SitlSettings
 
-    if path.stem.startswith("sitl_"):
-        load_model(path, SitlSettings)
-        return "firmware in the loop"
-    stand_in = path.stem.startswith("standin_")
-    special = {
-        "ardrone2": ArdroneSettings,
-        "pelican": PelicanSettings,
-        "standin_ardrone2": ArdroneStandinSettings,
-        "standin_pelican": PelicanStandinSettings,
+    by_name = {
+        "ardrone2": ("autopilot", ArdroneSettings),
+        "pelican": ("autopilot", PelicanSettings),
+        "simulated": ("simulated vehicle", SimulatedManners),
+        "standin_ardrone2": ("stand-in autopilot", ArdroneStandinSettings),
+        "standin_pelican": ("stand-in autopilot", PelicanStandinSettings),
     }
-    load_model(path, special.get(path.stem, Settings if stand_in else Autopilot))
-    return "stand-in autopilot" if stand_in else "autopilot"
+    by_prefix = {
+        "sitl_": ("firmware in the loop", SitlSettings),
+        "standin_": ("stand-in autopilot", Settings),
+        "gamepad_": ("gamepad", GamepadMap),
+        "": ("autopilot", Autopilot),
+    }
+    prefix = next(prefix for prefix in by_prefix if path.stem.startswith(prefix))
+    what, model = by_name.get(path.stem, by_prefix[prefix])
+    load_model(path, model)
+    return what
 
 
 def print_draws(name: str, seed: int | None, missions: int, overrides: Sequence[str]) -> None:
