@@ -24,6 +24,7 @@ from swarmsim.autopilot.guard import Guard, outline_of
 from swarmsim.autopilot.link import Setpoint
 from swarmsim.autopilot.mavlink import MavlinkVehicle
 from swarmsim.config.autopilot import Autopilot, SetpointLimits
+from swarmsim.config.bare import bare_scenario
 from swarmsim.config.errors import InputError
 from swarmsim.config.mission import Timing
 from swarmsim.config.scenario import Scenario
@@ -35,7 +36,6 @@ from swarmsim.sitl.link import seat_of
 from swarmsim.sitl.lockstep import Lockstep
 from swarmsim.sitl.plant import Plant
 from swarmsim.sitl.px4 import Px4Link
-from swarmsim.sitl.scenario import bare_scenario
 from swarmsim.sitl.settings import SitlSettings, load_sitl_settings
 from swarmsim.world.step import step
 

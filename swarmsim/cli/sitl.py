@@ -69,6 +69,7 @@ def _run(
 ) -> int:  # fmt: skip
     from swarmsim.atomic_folder import claimed
     from swarmsim.autopilot.frames import Geodetic
+    from swarmsim.config.bare import bare_scenario
     from swarmsim.config.mission import Timing
     from swarmsim.config.sensors import Place
     from swarmsim.runtime.devices import use_all_cores
@@ -77,7 +78,6 @@ def _run(
     from swarmsim.sitl.lockstep import Lockstep
     from swarmsim.sitl.plant import Plant
     from swarmsim.sitl.report import summary_of, write
-    from swarmsim.sitl.scenario import bare_scenario
 
     timing = Timing(
         control_period_s=settings.period_s, physics_steps=settings.physics_steps, judge_period_s=settings.judge_period_s

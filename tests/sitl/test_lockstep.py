@@ -7,6 +7,7 @@ import pytest
 
 import swarmsim
 from swarmsim.autopilot.frames import Geodetic
+from swarmsim.config.bare import bare_scenario
 from swarmsim.config.mission import Timing
 from swarmsim.config.sensors import Place
 from swarmsim.sitl.ardupilot import ArdupilotLink
@@ -15,7 +16,6 @@ from swarmsim.sitl.lockstep import Lockstep
 from swarmsim.sitl.plant import ACTUATORS, Plant
 from swarmsim.sitl.px4 import Px4Link
 from swarmsim.sitl.report import summary_of, table_of
-from swarmsim.sitl.scenario import bare_scenario
 from swarmsim.sitl.settings import load_sitl_settings
 from swarmsim.vehicles.state import GRAVITY_M_S2
 from tests.autopilot.ports import free_port

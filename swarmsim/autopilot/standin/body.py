@@ -9,13 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmsim.config.bare import bare_scenario
 from swarmsim.config.errors import InputError
-from swarmsim.config.flight import BatteryFailsafe, Failsafes, Fence, WindFailsafe
-from swarmsim.config.load import load_named
-from swarmsim.config.mission import Definitions, Mission, Phase, TeamMember, Timing
+from swarmsim.config.mission import Mission, Phase, TeamMember, Timing
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.scenario import Scenario, load_scenario, scenario_of
-from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.control.commands import POSITION, ROTOR_SPEED, MultirotorCommand, SkidSteerCommand
 from swarmsim.world import events
 from swarmsim.world.kinds import KINDS
@@ -191,10 +189,12 @@ def scenario_alone(mission: str | None, vehicle: str | None, step_s: float, defa
 
     ``default`` is the site, type and position of the vehicle when no ``mission`` is given. Raises `InputError`.
     """
-    if mission is None:
-        member = TeamMember(name=vehicle or "vehicle", type=default["type"], position_m=tuple(default["position_m"]))
-        return scenario_of(_alone(member, load_named("vehicles", member.type), step_s, site=default["site"]))
-    return alone_of(load_scenario(mission), vehicle, step_s)
+    if mission is not None:
+        return alone_of(load_scenario(mission), vehicle, step_s)
+    member = TeamMember(name=vehicle or "vehicle", type=default["type"], position_m=tuple(default["position_m"]))
+    holds = Phase(name="hold", who=(member.name,), policy="hold", time_limit_s=60.0)
+    whole = Mission(name="standin", site=default["site"], sources=(), vehicles=(member,), phases=(holds,))
+    return alone_of(scenario_of(whole), vehicle, step_s)
 
 
 def alone_of(whole: Scenario, vehicle: str | None, step_s: float) -> Scenario:
@@ -208,24 +208,4 @@ def alone_of(whole: Scenario, vehicle: str | None, step_s: float) -> Scenario:
             allowed=one_of(names),
             suggestion=did_you_mean(chosen, names),
         )
-    number = names.index(chosen)
-    kept = {name: getattr(whole.mission, name) for name in ("site", "engine", "wind", "effects", "seed")}
-    alone = _alone(whole.members[number], whole.vehicles[number], step_s, **kept)
-    return scenario_of(alone, whole.mission_file)
-
-
-def _alone(member: TeamMember, vehicle: Multirotor | SkidSteer, step_s: float, **fields: Any) -> Mission:
-    cited = {place: text for place, text in vehicle.sources.items() if place.split(".")[0] != "detector"}
-    bare = vehicle.model_copy(update={"detector": None, "sources": cited})
-    return Mission(
-        name="standin",
-        sources=(),
-        vehicles=(member.model_copy(update={"formation": None}),),
-        timing=Timing(judge_period_s=step_s),
-        phases=(Phase(name="standin", who=(member.name,), policy="hold", time_limit_s=60.0),),
-        failsafes=Failsafes(
-            fence=Fence(action="none"), wind=WindFailsafe(action="none"), battery=BatteryFailsafe(action="none")
-        ),
-        definitions=Definitions(vehicles={member.type: bare}),
-        **fields,
-    )
+    return bare_scenario(whole, [names.index(chosen)], "standin", Timing(judge_period_s=step_s))

@@ -1,4 +1,4 @@
-"""What of a mission firmware flies: some of its vehicles on its site, without phases, detectors and our failsafes."""
+"""What of a mission an autopilot flies: some of its vehicles on its site, without phases, detectors and failsafes."""
 
 from collections.abc import Sequence
 
