@@ -26,16 +26,14 @@ from swarmsim.autopilot.mavlink import MavlinkVehicle
 from swarmsim.config.autopilot import Autopilot, SetpointLimits
 from swarmsim.config.bare import bare_scenario
 from swarmsim.config.errors import InputError
-from swarmsim.config.mission import Timing
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.sensors import Place
 from swarmsim.control.commands import PositionCommand
-from swarmsim.sitl.ardupilot import ArdupilotLink
 from swarmsim.sitl.firmware import STARTS, Firmware
 from swarmsim.sitl.link import seat_of
 from swarmsim.sitl.lockstep import Lockstep
+from swarmsim.sitl.opening import open_link
 from swarmsim.sitl.plant import Plant
-from swarmsim.sitl.px4 import Px4Link
 from swarmsim.sitl.settings import SitlSettings, load_sitl_settings
 from swarmsim.world.step import step
 
@@ -135,7 +133,7 @@ class Session:
         """Start both, and wait until they have met."""
         origin = Geodetic(**settings.origin.model_dump())
         seat = seat_of(scenario.members[0].name, 0, scenario.vehicles[0], settings, origin)
-        link = {"px4": Px4Link, "ardupilot": ArdupilotLink}[settings.autopilot](seat, settings)
+        link = open_link(seat, settings)
         stack.callback(link.close)
         plant = Plant(scenario, Place(altitude_m=origin.altitude_m), settings.sensors)
         self.lockstep = Lockstep(plant, [link], settings, 1.0)
@@ -270,12 +268,7 @@ def main(
         if not command:
             raise InputError.of(f"{STARTS[kind]} does not say how {kind} is started", path="--autopilot", given=kind)
         settings = load_sitl_settings(kind)
-        timing = Timing(
-            control_period_s=settings.period_s,
-            physics_steps=settings.physics_steps,
-            judge_period_s=settings.judge_period_s,
-        )
-        flown[kind] = theirs(bare_scenario(whole, [0], "sitl", timing), settings, command, out / kind)
+        flown[kind] = theirs(bare_scenario(whole, [0], "sitl", settings.timing), settings, command, out / kind)
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     for name, parts in flown.items():

@@ -16,7 +16,7 @@ from swarmsim.config.errors import InputError
 
 if TYPE_CHECKING:
     from swarmsim.config.scenario import Scenario
-    from swarmsim.sitl.link import FirmwareLink, Seat
+    from swarmsim.sitl.link import FirmwareLink
     from swarmsim.sitl.lockstep import Lockstep
     from swarmsim.sitl.settings import SitlSettings
 
@@ -70,19 +70,16 @@ def _run(
     from swarmsim.atomic_folder import claimed
     from swarmsim.autopilot.frames import Geodetic
     from swarmsim.config.bare import bare_scenario
-    from swarmsim.config.mission import Timing
     from swarmsim.config.sensors import Place
     from swarmsim.runtime.devices import use_all_cores
     from swarmsim.sitl.firmware import STARTS, Firmware, check_all
     from swarmsim.sitl.link import FirmwareError, seat_of
     from swarmsim.sitl.lockstep import Lockstep
+    from swarmsim.sitl.opening import open_link
     from swarmsim.sitl.plant import Plant
     from swarmsim.sitl.report import summary_of, write
 
-    timing = Timing(
-        control_period_s=settings.period_s, physics_steps=settings.physics_steps, judge_period_s=settings.judge_period_s
-    )
-    scenario = bare_scenario(whole, numbers, "sitl", timing)
+    scenario = bare_scenario(whole, numbers, "sitl", settings.timing)
     place = whole.mission.autopilot.origin or settings.origin
     origin = Geodetic(**place.model_dump())
     seats = [
@@ -91,7 +88,10 @@ def _run(
     ]
     command = start if start is not None else os.environ.get(STARTS[settings.autopilot])
     with claimed(folder), ExitStack() as stack:
-        links = [_link_of(seat, settings, stack) for seat in seats]
+        links = []
+        for seat in seats:
+            links.append(open_link(seat, settings))
+            stack.callback(links[-1].close)
         use_all_cores()
         with console.status("load or compile the physics"):
             plant = Plant(scenario, Place(altitude_m=place.altitude_m), settings.sensors, whole.mission.seed)
@@ -106,12 +106,12 @@ def _run(
         try:
             lockstep.connect(lambda: check_all(processes))
             console.print("all connected")
-            lockstep.run(duration_s, lambda: _tell(lockstep, console))
+            lockstep.run(lockstep.time_s + duration_s, lambda: _tell(lockstep, console))
         except FirmwareError:
             check_all(processes)  # one that ended tells more than its silence
             raise
         finally:
-            if lockstep.tracks.time_s:
+            if lockstep.began_s is not None:
                 summary = summary_of(lockstep, settings.autopilot, scenario.mission.engine)
                 write(folder, lockstep, summary)
                 _tell(lockstep, console)
@@ -144,16 +144,6 @@ def _is_session(folder: Path) -> bool:
     )
 
 
-def _link_of(seat: "Seat", settings: "SitlSettings", stack: ExitStack) -> "FirmwareLink":
-    from swarmsim.sitl.ardupilot import ArdupilotLink
-    from swarmsim.sitl.px4 import Px4Link
-
-    kinds: dict[str, type[Px4Link] | type[ArdupilotLink]] = {"px4": Px4Link, "ardupilot": ArdupilotLink}
-    link = kinds[settings.autopilot](seat, settings)
-    stack.callback(link.close)
-    return link
-
-
 def _introduce(
     links: "Sequence[FirmwareLink]", settings: "SitlSettings", command: str | None, console: Console
 ) -> None:
@@ -173,8 +163,9 @@ def _tell(lockstep: "Lockstep", console: Console) -> None:
         f"longest wait {1e3 * longest:.0f} ms",
         highlight=False,
     )
-    for name, place, intact in zip(
-        lockstep.plant.names, lockstep.plant.truth.position_m, lockstep.plant.truth.intact, strict=True
-    ):
+    truth = lockstep.plant.truth
+    for link, place, intact in zip(lockstep.links, truth.position_m, truth.intact, strict=True):
         where = ", ".join(f"{x:.1f}" for x in place)
-        console.print(f"            {escape(name)} at ({where}) m{'' if intact else ', crashed'}", highlight=False)
+        told = "" if intact else ", crashed"
+        told += f", its firmware has begun anew {link.restarts} times" if link.restarts else ""
+        console.print(f"            {escape(link.seat.name)} at ({where}) m{told}", highlight=False)

@@ -39,6 +39,7 @@ class FirmwareLink(Protocol):
 
     seat: Seat
     address: str
+    restarts: int  # times that the firmware has begun anew during the session
 
     def connected(self) -> bool:
         """Whether the firmware has come; to be asked again and again. Never waits."""

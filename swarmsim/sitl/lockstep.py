@@ -31,7 +31,7 @@ class Tracks:
     """What happened, every `LOGGED_S`: true states of all vehicles and what the firmware commanded."""
 
     time_s: list[float] = field(default_factory=list)
-    rows: list[NDArray[np.float64]] = field(default_factory=list)  # each [K, 10 + actuators]
+    rows: list[NDArray[np.float64]] = field(default_factory=list)  # each [K, 11 + actuators]
 
 
 class Lockstep:
@@ -87,7 +87,7 @@ class Lockstep:
             plant.step(actuators)
             now = time.monotonic()
             self.wall_s = now - self.began_s
-            if plant.tick % self._every == 0:
+            if plant.tick % self._every == 0 or self.time_s >= until_s:
                 self._log(actuators)
             if now > next_s:
                 told()
@@ -122,4 +122,5 @@ class Lockstep:
     def _log(self, actuators: NDArray[np.float64]) -> None:
         t = self.plant.truth
         self.tracks.time_s.append(t.time_s)
-        self.tracks.rows.append(np.concatenate([t.position_m, t.velocity_m_s, t.quaternion, actuators], axis=1))
+        row = [t.position_m, t.velocity_m_s, t.quaternion, t.charge[:, None], actuators]
+        self.tracks.rows.append(np.concatenate(row, axis=1))

@@ -27,7 +27,7 @@ from swarmsim.world.step import step
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-_TRUTH = 23  # numbers of the truth in a vehicle's row; its readings follow
+_TRUTH = 21  # numbers of the truth in a vehicle's row; its readings follow
 ACTUATORS = 8
 """Length of a vehicle's actuator vector: rotor speeds over the largest one, or a rover's left and right wheels."""
 
@@ -43,8 +43,6 @@ class Truth:
     angular_velocity_rad_s: Array  # [K, 3] body
     specific_force_m_s2: Array  # [K, 3] body: mean over the step, what an ideal accelerometer reads
     air_velocity_m_s: Array  # [K, 3] body: of the vehicle through the air
-    height_m: Array  # [K] of the centre of mass above the ground
-    voltage_v: Array  # [K] of the battery; NaN of a rover
     charge: Array  # [K] share of the battery left
     intact: Bools  # [K] it has not crashed or collided
 
@@ -193,16 +191,10 @@ _COMMANDS: dict[str, Callable[..., Any]] = {"multirotor": _rotors, "skid_steer":
 
 
 def _numbers(group: Group, before: GroupState, after: GroupState, dt: float) -> jax.Array:
-    """States [U, 23] of a group's vehicles, in the order of `_truth`."""
-    voltage = after.vehicle.voltage_v if KINDS[group.kind].FLIES else jnp.full(group.size, jnp.nan)
+    """States [U, 21] of a group's vehicles, in the order of `_truth`."""
     period_s = jnp.float32(dt)
     t = jax.vmap(partial(truth_of, period_s))(before.vehicle.body, replace(after, counter=None))
-    last = [
-        t.height_m,
-        voltage,
-        1.0 - after.vehicle.energy_j / group.limits.battery_j,
-        jax.vmap(events.intact)(after.event_time_s),
-    ]
+    last = [1.0 - after.vehicle.energy_j / group.limits.battery_j, jax.vmap(events.intact)(after.event_time_s)]
     vectors = [t.position_m, t.velocity_m_s, t.quaternion, t.angular_velocity_rad_s, t.specific_force_m_s2]
     return jnp.concatenate([*vectors, t.air_velocity_m_s, jnp.stack(last, axis=-1).astype(jnp.float32)], axis=-1)
 
@@ -216,8 +208,6 @@ def _truth(time_s: float, x: Array) -> Truth:
         angular_velocity_rad_s=x[:, 10:13],
         specific_force_m_s2=x[:, 13:16],
         air_velocity_m_s=x[:, 16:19],
-        height_m=x[:, 19],
-        voltage_v=x[:, 20],
-        charge=x[:, 21],
-        intact=x[:, 22] > 0.5,
+        charge=x[:, 19],
+        intact=x[:, 20] > 0.5,
     )

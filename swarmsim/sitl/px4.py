@@ -41,6 +41,7 @@ class Px4Link:
         port = settings.port + seat.number * settings.port_step
         self.address = f"tcp {LOOPBACK}:{port}"
         self.actuators: Array = np.zeros(ACTUATORS)
+        self.restarts = 0  # its link does not outlast PX4: one that begins anew ends the session
         self.armed = False
         self._protocol = Protocol(SYSTEM, COMPONENT)
         self._told_us = 0

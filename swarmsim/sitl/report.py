@@ -31,6 +31,8 @@ def summary_of(lockstep: Lockstep, autopilot: str, engine: str) -> dict[str, Any
                 "missed": waits.missed,
                 "longest_wait_s": waits.longest_s,
                 "mean_wait_s": waits.total_s / waits.answers if waits.answers else None,
+                "restarts": link.restarts,
+                "battery_left": float(lockstep.plant.truth.charge[link.seat.number]),
                 "intact": bool(lockstep.plant.truth.intact[link.seat.number]),
             }
             for link, waits in zip(lockstep.links, lockstep.waits, strict=True)
@@ -39,11 +41,12 @@ def summary_of(lockstep: Lockstep, autopilot: str, engine: str) -> dict[str, Any
 
 
 def table_of(lockstep: Lockstep) -> pa.Table:
-    """A row for each vehicle and time: true position m, velocity m/s (world ENU), quaternion, actuators (-1 to 1)."""
+    """A row for each vehicle and time: true position m, velocity m/s (world ENU), quaternion, battery, actuators."""
     names = [link.seat.name for link in lockstep.links]
-    rows = np.asarray(lockstep.tracks.rows, np.float64).reshape(-1, 10 + ACTUATORS)
+    rows = np.asarray(lockstep.tracks.rows, np.float64).reshape(-1, 11 + ACTUATORS)
     columns = [f"position_{a}_m" for a in "xyz"] + [f"velocity_{a}_m_s" for a in "xyz"]
-    columns += [f"quaternion_{a}" for a in "wxyz"] + [f"actuator_{n}" for n in range(ACTUATORS)]
+    columns += [f"quaternion_{a}" for a in "wxyz"] + ["battery_left"]
+    columns += [f"actuator_{n}" for n in range(ACTUATORS)]
     times = np.repeat(np.asarray(lockstep.tracks.time_s, np.float64), len(names))
     own = {"time_s": times, "vehicle": names * len(lockstep.tracks.time_s)}
     return pa.table(own | dict(zip(columns, rows.T, strict=True)))

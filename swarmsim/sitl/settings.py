@@ -8,6 +8,7 @@ from swarmsim.autopilot.settings import load_settings
 from swarmsim.config.autopilot import Origin
 from swarmsim.config.base import Delay, Duration, Model, Name
 from swarmsim.config.errors import InputError
+from swarmsim.config.mission import Timing
 
 KINDS = ("px4", "ardupilot")
 
@@ -51,6 +52,13 @@ class SitlSettings(Model):
     wait_s: Duration
     lost_s: Duration
     stall_s: Delay
+
+    @property
+    def timing(self) -> Timing:
+        """Timing of a world that is stepped once an exchange."""
+        return Timing(
+            control_period_s=self.period_s, physics_steps=self.physics_steps, judge_period_s=self.judge_period_s
+        )
 
     def link_of(self, number: int) -> str:
         """The link string of ``swarmsim fly`` for a vehicle."""

@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 
-import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from swarmsim.autopilot.mavlink.wire import Protocol
@@ -99,15 +98,3 @@ def _connected(port: int, over: threading.Event) -> socket.socket | None:
         except OSError:
             time.sleep(0.02)
     return None
-
-
-def hovering(height_m: float, hover: float, ground_pa: float = 0.0) -> Callable[[dict], list[float]]:
-    """Outputs that climb by the barometer alone, without attitude control: level vehicles rise straight up."""
-
-    def law(heard: dict) -> list[float]:
-        sensors = heard["HIL_SENSOR"]
-        fresh = [m.pressure_alt for m in sensors if m.fields_updated & 0x800]
-        climbed = float(np.mean(fresh[-10:]) - fresh[0]) if fresh else 0.0
-        return [hover * (1.0 + 0.05 * np.clip(height_m - climbed, -1.0, 1.0))] * 4
-
-    return law

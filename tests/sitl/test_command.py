@@ -184,10 +184,16 @@ def test_a_session_from_start_to_report(folder, monkeypatch, capsys):
     report = json.loads((folder / "out" / "sitl.json").read_text(encoding="utf-8"))
     assert report["vehicles"][0]["missed"] == 0
     assert report["simulated_s"] == pytest.approx(1.0, abs=0.01)
+    assert report["vehicles"][0]["restarts"] == 0
+    assert 0.99 < report["vehicles"][0]["battery_left"] < 1.0
     table = pq.read_table(folder / "out" / "sitl.parquet").to_pydict()
     assert np.isfinite(table["position_z_m"]).all()
+    assert table["battery_left"][0] > table["battery_left"][-1] == report["vehicles"][0]["battery_left"]
     assert "at work" in (folder / "out" / "uav1" / "firmware.log").read_text(encoding="utf-8")
     assert main([*arguments, "--start", "echo broken; exit 1"]) == 2  # there is a session already
+    one_step = [*arguments[:6], "--duration", "0.001", "--out", "out", "--force", "--start", start]
+    assert main(one_step) == 0
+    assert len(pq.read_table(folder / "out" / "sitl.parquet")) == 1
     assert main([*arguments, "--force", "--start", "echo broken; exit 1"]) == 4
     assert "broken" in capsys.readouterr().err
 

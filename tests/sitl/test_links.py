@@ -2,6 +2,7 @@
 
 import math
 import socket
+import struct
 import threading
 import time
 
@@ -34,8 +35,6 @@ def truth(**changes):
         "angular_velocity_rad_s": np.array([[0.1, 0.2, 0.3]]),
         "specific_force_m_s2": np.array([[0.5, 0.25, 9.80665]]),
         "air_velocity_m_s": np.array([[3.0, 4.0, 0.0]]),
-        "height_m": np.array([5.0]),
-        "voltage_v": np.array([16.0]),
         "charge": np.array([0.9]),
         "intact": np.array([True]),
     }
@@ -211,3 +210,14 @@ def test_one_that_talks_without_end_and_does_not_answer_is_not_waited_for(kind, 
         talker.join()
         peer.close()
         made.close()
+
+
+def test_a_firmware_that_begins_anew_is_counted():
+    port = free_port(socket.SOCK_DGRAM)
+    link = ArdupilotLink(SEAT, load_sitl_settings("ardupilot").model_copy(update={"port": port}))
+    try:
+        for frame in (0, 1, 2, 2, 0, 1):  # a request that is repeated is no new begin
+            link._take(struct.pack("<HHI16H", 18458, 400, frame, *[1500] * 16), ("127.0.0.1", 1))
+        assert link.restarts == 1
+    finally:
+        link.close()
