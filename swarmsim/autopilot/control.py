@@ -4,6 +4,7 @@ Three threads meet here. The link's reader tells of mode changes at once, and an
 anything else; the stream sends setpoints; the thread of the flight arms, watches and ends.
 """
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -47,10 +48,12 @@ class Control:
         self.state = State.STANDS
         self.alarm: Alarm | None = None
         self.takeover_s: tuple[float, float] | None = None  # when an operator's was seen, and when the stream halted
+        dogs = settings.watchdogs
         self.stream = SetpointStream(
-            link.send, guard, settings.stream_hz, settings.watchdogs.stale_s, self._on_stale, self._on_error
+            link.send, guard, settings.stream_hz, dogs.stale_s, dogs.planning_s, self._on_stale, self._on_error
         )
-        self._stage, self._watch = stage, Watch(settings.watchdogs)
+        self._stage, self._watch = stage, Watch(dogs)
+        self._stuck: threading.Timer | None = None  # acts for the thread of the flight if that does not
         self._lock = threading.Lock()
         self._mode: Mode | None = None  # the mode that we brought about; another one is somebody else's
         self._armed = False  # we armed it
@@ -78,6 +81,7 @@ class Control:
 
     def watch(self) -> bool:
         """Look for what is wrong, and act on it; whether the vehicle is still ours."""
+        self.stream.renew()
         t = self.link.telemetry()
         if self.state in (State.STARTS, State.FOLLOWS):
             if self._armed:
@@ -100,6 +104,7 @@ class Control:
         if not self._may_start(waiting):
             return False
         self.state = State.STARTS
+        self._watch.forget()
         if link.streams_first:
             self.stream.resume()
             self.offer(waiting, keep=True)
@@ -201,6 +206,7 @@ class Control:
 
     def stop(self) -> None:
         """The user stops: end as the settings say, and wait until the vehicle stands."""
+        self._awake()
         if self.state is State.STARTS and not self.link.telemetry().armed:
             self.stream.halt()
             self._mode, self.state = None, State.STANDS
@@ -215,6 +221,10 @@ class Control:
         ours = {Mode.FOLLOW}
         if self._mode is Mode.HOLD and self.state in (State.STARTS, State.FOLLOWS):
             ours.add(Mode.HOLD)  # it was to hold for a while only
+        self._awake()
+        if self.state is State.STARTS and not self.link.telemetry().armed:
+            with contextlib.suppress(LinkError):  # our command to arm may be on its way
+                self.link.disarm(self.settings.answer_s)
         self._mode = None
         self.stream.halt()
         how = self.settings.watchdogs.then
@@ -244,11 +254,14 @@ class Control:
 
     def _handle(self, alarm: Alarm) -> None:
         """Do what an alarm asks for; the vehicle's part in the mission has ended."""
+        self._awake()
         self._stage(alarm.reason)
         if alarm.action is Action.RELEASE:
             self._release()
             return
-        if alarm.action is Action.HOLD and not self._held():
+        then = _MODES[self.settings.watchdogs.then]
+        begun = self._mode is then  # while this thread was stuck
+        if alarm.action is Action.HOLD and not begun and not self._held():
             return
         self.end(self.settings.watchdogs.then)
 
@@ -292,14 +305,32 @@ class Control:
         self.stream.halt()
         self._mode, self.state = None, State.RELEASED
 
-    def _on_stale(self) -> None:
+    def _on_stale(self, age_s: float) -> None:
         if self._mode is Mode.FOLLOW:
-            stale = self.settings.watchdogs.stale_s
-            self._raise(Alarm(Action.HOLD, f"the mission gave no setpoint for {stale:g} s: this computer is too slow"))
+            reason = f"the mission gave no setpoint for {age_s:.1f} s: this computer is too slow"
+            self._raise(Alarm(Action.HOLD, reason))
             if self.link.telemetry().mode is Mode.FOLLOW:  # who should act on it may be stuck: it is asked to hold here
                 self._mode = Mode.HOLD
                 self.stream.halt()
                 self.link.request(Mode.HOLD)
+                self._stuck = threading.Timer(self.settings.watchdogs.hold_s, self._on_stuck)
+                self._stuck.daemon = True
+                self._stuck.start()
+
+    def _on_stuck(self) -> None:
+        """The thread of the flight has not acted on an alarm: what comes after the hold is asked for here."""
+        with self._lock:
+            if self._stuck is None or self._mode is not Mode.HOLD or self.link.telemetry().mode is not Mode.HOLD:
+                return
+            self._mode = _MODES[self.settings.watchdogs.then]
+            self.link.request(self._mode)
+
+    def _awake(self) -> None:
+        """The thread of the flight acts."""
+        with self._lock:
+            if self._stuck is not None:
+                self._stuck.cancel()
+                self._stuck = None
 
     def _on_error(self, error: Exception) -> None:
         self.failed(f"a setpoint could not be sent: {error}")
@@ -329,10 +360,13 @@ def recover(link: VehicleLink, how: str, settings: Autopilot, tell: Callable[[st
     drives = link.identity.vehicle == "rover"
     mode = Mode.HOLD if drives and how == "land" else _MODES[how]
     link.enter(mode, settings.answer_s)
+    kept = {mode, Mode.LAND} if mode is Mode.RETURN else {mode}
     tell(f"it does: {mode.value}")
     end, slow = time.monotonic() + settings.land_s, time.monotonic()
     while (t := link.telemetry()).armed:
         now = time.monotonic()
+        if t.mode not in kept and not t.failsafe:
+            raise LinkError(f"the operator took over with mode {t.mode_name}: nothing more is asked of it")
         if t.velocity_m_s is None or float(np.hypot(*t.velocity_m_s[:2])) > RESTS_M_S:
             slow = now
         if drives and now - slow > RESTS_S:

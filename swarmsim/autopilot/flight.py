@@ -113,6 +113,7 @@ class Flight:
         self._begin()
         due = time.monotonic()
         while True:
+            self._wanted = self._wanted and live.phase() is not None  # it may have ended while the vehicle landed
             if self._wanted and control.state is State.STANDS:
                 self._take_off()
                 due = time.monotonic()
@@ -157,6 +158,9 @@ class Flight:
         if t.position_m is None or t.quaternion is None:
             raise LinkError("the vehicle tells no position or attitude any more: check its state estimate")
         x, y, z = t.position_m
+        first = self.live.step(self._body(t), 1.0 if t.battery is None else t.battery)
+        if first.in_phase:
+            setpoint_of(first.command)  # one that no autopilot takes is refused on the ground
         height = self.settings.take_off_m if self.flies else 0.0
         if self.control.start((x, y, z + height), yaw_of_quaternion(t.quaternion)):
             self._stage("mission")

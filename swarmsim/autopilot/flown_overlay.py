@@ -17,12 +17,14 @@ from swarmsim.runtime.live import LiveMission
 from swarmsim.runtime.simulation import Simulation
 
 
-def flown_track(log: FlownLog) -> Track:
-    """Where the vehicle was measured, on the mission's clock."""
+def flown_track(log: FlownLog, *, by_hand: bool = True) -> Track:
+    """Where the vehicle was measured, on the mission's clock; with or without what was flown by hand."""
     rows = np.asarray(log.rows, np.float64)
     if not len(rows):
         return Track(np.zeros(0), np.zeros((0, 3)))
     known = np.isfinite(rows[:, 8:11]).all(axis=1) & np.r_[np.diff(rows[:, 0]) > 0.0, True]
+    if not by_hand:
+        known &= ~np.asarray(log.by_hand, bool)
     return Track(rows[known, 0], rows[known, 8:11])
 
 
@@ -36,11 +38,11 @@ def write_overlay(
     Raises `LinkError` where the simulated vehicle is commanded what cannot be sent.
     """
     simulated, planned = simulate(simulation, live)
-    flown = flown_track(log)
-    made = compare(flown, planned, simulated)
+    flown, judged = flown_track(log), flown_track(log, by_hand=False)
+    made = compare(judged, planned, simulated)
     offset = log.rows[0][0] - log.rows[0][1]  # from the flight's clock to the mission's
     marks = tuple((when + offset, f"{vehicle}: {what}") for when, what in log.events)
-    overlay = Overlay(vehicle, flown, flown, made, planned, simulated, marks)
+    overlay = Overlay(vehicle, flown, judged, made, planned, simulated, marks)
     write_simulated(folder, simulated, planned)
     write_figure(overlay, simulation.site_model, folder / FIGURES)
     new = folder / f"{RECORDING}.new"  # the viewer's old file stays whole until the new one is

@@ -17,19 +17,21 @@ PRIORITY = -10  # nice value of the thread; it needs a few microseconds in each 
 class SetpointStream:
     """Sends the latest setpoint at a fixed rate until it is halted.
 
-    A setpoint that is not renewed for ``stale_s`` is not sent again: then ``on_stale`` is called, once, and the stream
-    is silent until a new one is offered. `halt` takes effect before it returns: no byte leaves afterwards.
+    A setpoint that is not renewed for ``stale_s`` is not sent again: then ``on_stale`` is called, once, with its age in
+    s, and the stream is silent until a new one is offered. One that is to be kept lasts ``kept_s``. `halt` takes effect
+    before it returns: no byte leaves afterwards.
     """
 
     def __init__(
-        self, send: Callable[[Setpoint], None], guard: Guard, rate_hz: float, stale_s: float,
-        on_stale: Callable[[], None], on_error: Callable[[Exception], None],
+        self, send: Callable[[Setpoint], None], guard: Guard, rate_hz: float, stale_s: float, kept_s: float,
+        on_stale: Callable[[float], None], on_error: Callable[[Exception], None],
     ):  # fmt: skip
         """Nothing is sent yet.
 
         ``on_stale`` and ``on_error`` (``send`` failed; the stream has ended) are called in the stream's thread.
         """
-        self._send, self._guard, self._period_s, self._stale_s = send, guard, 1.0 / rate_hz, stale_s
+        self._send, self._guard, self._period_s = send, guard, 1.0 / rate_hz
+        self._lasts_s = {False: stale_s, True: kept_s}
         self._on_stale, self._on_error = on_stale, on_error
         self._lock = threading.Lock()  # held while a setpoint is sent
         self._latest: tuple[float, Setpoint] | None = None
@@ -44,13 +46,19 @@ class SetpointStream:
         self._thread.start()
 
     def offer(self, setpoint: Setpoint, *, keep: bool = False) -> None:
-        """The setpoint to send from now on; with ``keep`` it never becomes stale: it holds the vehicle meanwhile.
+        """The setpoint to send from now on; with ``keep`` it holds the vehicle for longer, while the mission plans.
 
         Raises `RefusedError` where it must not be sent; the one before stays.
         """
         now = time.monotonic()
         with self._lock:
             self._latest, self._kept = (now, self._guard.check(setpoint, now)), keep
+
+    def renew(self) -> None:
+        """A setpoint that is kept lasts as long again: whoever offered it is still there."""
+        with self._lock:
+            if self._kept and self._latest is not None:
+                self._latest = time.monotonic(), self._latest[1]
 
     def halt(self) -> None:
         """Send nothing more. When it returns nothing is under way either."""
@@ -87,33 +95,33 @@ class SetpointStream:
         due = time.monotonic()
         while not self._over.wait(max(0.0, due - time.monotonic())):
             try:
-                stale = self._once()
+                age_s = self._once()
             except Exception as error:  # a link may fail in any way; the flight is told
                 self._halted = True
                 self._on_error(error)
                 return
-            if stale:
-                self._on_stale()
+            if age_s is not None:
+                self._on_stale(age_s)
             now = time.monotonic()
             due += self._period_s
             if due < now - self._period_s:  # the process was suspended: what is missed is not made up for
                 due = now
 
-    def _once(self) -> bool:
-        """Send what is due; whether it has just become stale."""
+    def _once(self) -> float | None:
+        """Send what is due; the age of one that has just become stale, s."""
         with self._lock:
             if self._halted or self._latest is None:
                 if self._sent_s and np.isfinite(self._sent_s[-1]):
                     self._sent_s.append(np.nan)  # a pause
-                return False
+                return None
             offered_s, setpoint = self._latest
             now = time.monotonic()
-            if not self._kept and now - offered_s > self._stale_s:
+            if now - offered_s > self._lasts_s[self._kept]:
                 self._latest = None
-                return True
+                return now - offered_s
             self._send(setpoint)
             self._sent_s.append(now)
-            return False
+            return None
 
 
 __all__ = ["RefusedError", "SetpointStream"]

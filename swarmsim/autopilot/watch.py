@@ -1,5 +1,6 @@
 """What ends a vehicle's part in the mission: the operator, the vehicle's own failsafes, and what we watch ourselves."""
 
+import math
 import time
 from dataclasses import dataclass
 from enum import Enum
@@ -30,6 +31,7 @@ class Watch:
     """Judges telemetry while the vehicle follows setpoints."""
 
     limits: Watchdogs
+    _before: Telemetry | None = None  # with the last position but one
 
     def check(self, t: Telemetry, now_s: float | None = None) -> Alarm | None:
         """What is wrong now, the gravest first; None if nothing is."""
@@ -49,6 +51,9 @@ class Watch:
             )
         if t.position_m is None:
             return Alarm(Action.END, "its place is not known: the autopilot has restarted, with another origin")
+        jumped = self._jumped(t)
+        if jumped is not None:
+            return Alarm(Action.END, f"its measured position jumped by {jumped:.1f} m: its state estimate was reset")
         if t.estimate_ok is False:
             return Alarm(Action.END, "the autopilot's state estimate has failed")
         if t.battery is not None and t.battery < self.limits.battery:
@@ -57,6 +62,22 @@ class Watch:
                 f"the battery is at {100 * t.battery:.0f} %, watchdogs.battery is {100 * self.limits.battery:.0f} %",
             )
         return None
+
+    def forget(self) -> None:
+        """The next position is the first one."""
+        self._before = None
+
+    def _jumped(self, t: Telemetry) -> float | None:
+        """How far the position jumped since the last one, if that is farther than it can have moved."""
+        before, self._before = self._before, t
+        if before is None or before.position_m is None or before.pose_s is None:
+            return None
+        assert t.position_m is not None
+        assert t.pose_s is not None
+        apart = math.dist(t.position_m, before.position_m)
+        speed = max(math.hypot(*(one.velocity_m_s or (0.0,))) for one in (before, t))
+        moved = 2.0 * speed * (t.pose_s - before.pose_s)
+        return apart if apart > self.limits.jump_m + moved else None
 
     def disarmed(self, t: Telemetry) -> Alarm | None:
         """The alarm if the vehicle is no longer armed."""

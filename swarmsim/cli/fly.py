@@ -203,7 +203,7 @@ def _flown(
             )
         except LinkError as error:
             return _failed(error)
-        stopped: KeyboardInterrupt | None = None
+        stopped: BaseException | None = None
         view: LiveView | None = None
         code = EXIT_FLIGHT
         try:
@@ -263,8 +263,8 @@ def _free(log: Path) -> Path:
     return path
 
 
-def _outcome(flight: Any, screen: "StatusLine") -> tuple[int, KeyboardInterrupt | None]:
-    """The exit code of a flight, and what stopped it."""
+def _outcome(flight: Any, screen: "StatusLine") -> tuple[int, BaseException | None]:
+    """The exit code of a flight, and what stopped it: to be raised when its results are written."""
     from swarmsim.autopilot.link import LinkError
 
     try:
@@ -277,6 +277,9 @@ def _outcome(flight: Any, screen: "StatusLine") -> tuple[int, KeyboardInterrupt 
     except KeyboardInterrupt as stop:
         flight.log.ended = flight.log.ended or "stopped by the user"
         return 0, stop
+    except Exception as error:
+        flight.log.ended = flight.log.ended or f"an error of the program: {error!r}"
+        return EXIT_FLIGHT, error
     return EXIT_FLIGHT if flight.control.alarm is not None else 0, None
 
 

@@ -37,14 +37,18 @@ class Watchdogs(Model):
     """After how long what is missed: setpoints of the mission, heartbeats and positions of the vehicle.
 
     A vehicle whose setpoints are ``stale_s`` old holds; ``hold_s`` later it does what ``then`` says, and the mission
-    does not take it back. A battery below ``battery`` ends its part of the mission.
+    does not take it back. The same happens to one that holds while the mission plans, after ``planning_s``. A battery
+    below ``battery`` ends its part of the mission, and so does a measured position that jumps by more than ``jump_m``
+    beyond what its speed explains: the state estimate was reset, and the setpoints are somewhere else now.
     """
 
     stale_s: Duration = 0.5
+    planning_s: Duration = 120.0
     hold_s: Delay = 5.0
     then: Literal["land", "return"] = "land"
     heartbeat_s: Duration = 3.0
     position_s: Duration = 1.0
+    jump_m: Gap = 3.0
     battery: Fraction = 0.2
 
 

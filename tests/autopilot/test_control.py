@@ -1,12 +1,13 @@
 """Control of a vehicle when something goes wrong at the worst moment, without a mission and without dynamics."""
 
+import threading
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from swarmsim.autopilot.control import Control, State
+from swarmsim.autopilot.control import Control, State, recover
 from swarmsim.autopilot.guard import Guard
 from swarmsim.autopilot.link import LinkError, Mode, Setpoint, Telemetry
 from swarmsim.autopilot.watch import Action, Alarm, Watch
@@ -153,10 +154,102 @@ def test_a_vehicle_whose_origin_is_another_is_not_flown_on():
     ("place_m", "reason"), [((120.0, 0.0, 2.0), "20.0 m outside"), ((0.0, 0.0, 150.0), "150.0 m above")]
 )
 def test_a_vehicle_that_leaves_the_volume_is_brought_down(link, place_m, reason):
-    control = controlled(link)
+    dogs = QUICK.watchdogs.model_copy(update={"jump_m": 1000.0})
+    control = controlled(link, QUICK.model_copy(update={"watchdogs": dogs}))
     assert control.start(ABOVE_M, 0.0)
     assert control.watch()
     link.place = np.array(place_m)  # as a wind, or velocities without a position, may take it
     assert not control.watch()
     assert reason in control.alarm.reason
     assert link.asked[-1] == "land"
+
+
+def test_a_vehicle_lands_though_the_thread_of_the_flight_stays_stuck(link):
+    control = controlled(link)
+    assert control.start(ABOVE_M, 0.0)
+    control.offer(Setpoint(position_m=(0.5, 0.0, 2.0)))
+    deadline = time.monotonic() + 10.0
+    while link.armed:  # nobody calls `watch` meanwhile
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert [what for what in link.asked if what.startswith("request")] == ["request hold", "request land"]
+    assert not control.watch()  # it wakes up, and takes its own landing for nobody else's
+    deadline = time.monotonic() + 10.0
+    while not control.stands():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert control.state is State.STANDS
+    assert not control.alarm.takeover
+
+
+def test_one_that_wakes_up_in_time_acts_itself(link):
+    control = controlled(link, QUICK.model_copy(update={"watchdogs": Watchdogs(stale_s=0.2, hold_s=1.0)}))
+    assert control.start(ABOVE_M, 0.0)
+    control.offer(Setpoint(position_m=(0.5, 0.0, 2.0)))
+    while link.mode is not Mode.HOLD:
+        time.sleep(0.01)
+    control.watch()
+    assert "request land" not in link.asked
+    assert link.asked[-2:] == ["hold", "land"]
+
+
+def test_a_hold_while_the_mission_plans_lasts_no_longer_than_it_may(link):
+    settings = QUICK.model_copy(update={"watchdogs": Watchdogs(stale_s=0.3, hold_s=60.0, planning_s=1.0)})
+    control = controlled(link, settings)
+    assert control.start(ABOVE_M, 0.0)
+    control.hold()
+    begin = time.monotonic()
+    while time.monotonic() - begin < 1.5:  # waited for by somebody who looks after it
+        assert control.watch()
+        time.sleep(0.05)
+    while link.mode is not Mode.HOLD:  # and now nobody does
+        assert time.monotonic() - begin < 15.0
+        time.sleep(0.01)
+    assert time.monotonic() - begin > 2.4
+    assert "no setpoint for 1.0 s" in control.alarm.reason
+
+
+def test_a_vehicle_that_arms_after_it_was_given_up_is_disarmed(link, monkeypatch):
+    control = controlled(link)
+
+    def late(timeout_s):
+        threading.Timer(0.3, lambda: link.change(link.mode, armed=True)).start()
+        raise LinkError("it was not armed within 0.1 s")
+
+    def disarm(timeout_s):
+        time.sleep(0.6)  # commands are done in their order
+        link.asked.append("disarm")
+        link.change(link.mode, armed=False)
+
+    monkeypatch.setattr(link, "arm", late)
+    monkeypatch.setattr(link, "disarm", disarm)
+    with pytest.raises(LinkError):
+        control.start(ABOVE_M, 0.0)
+    control.emergency()
+    assert link.asked[-1] == "disarm"
+    assert not link.armed
+
+
+@pytest.mark.parametrize(
+    ("moved_m", "speed_m_s", "jumped"), [(2.5, 0.0, False), (6.0, 0.0, True), (6.0, 8.0, False), (6.0, 2.0, True)]
+)
+def test_a_state_estimate_that_was_reset_is_seen(moved_m, speed_m_s, jumped):
+    now, watch = time.monotonic(), Watch(Watchdogs())
+    t = Telemetry(
+        heard_s=now, pose_s=now, position_m=(0.0, 0.0, 5.0), velocity_m_s=(speed_m_s, 0.0, 0.0), armed=True,
+        mode=Mode.FOLLOW,
+    )  # fmt: skip
+    assert watch.check(t, now) is None
+    alarm = watch.check(replace(t, pose_s=now + 0.2, position_m=(0.0, moved_m, 5.0)), now + 0.2)
+    assert (alarm is not None) == jumped
+    if jumped:
+        assert alarm.action is Action.END
+        assert "jumped by 6.0 m" in alarm.reason
+
+
+def test_what_is_recovered_is_left_to_an_operator_who_takes_it_over(link):
+    link.armed, link.mode, link.place = True, Mode.HOLD, np.array([0.0, 0.0, 20.0])
+    threading.Timer(0.3, lambda: link.change(Mode.OTHER)).start()
+    with pytest.raises(LinkError, match="operator took over"):
+        recover(link, "land", QUICK, lambda _: None)
+    assert link.asked == ["land"]

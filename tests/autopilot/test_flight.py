@@ -22,7 +22,7 @@ SURVEY = [
 ]  # fmt: skip
 QUICK = Autopilot(
     take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=10.0, land_s=20.0,
-    watchdogs=Watchdogs(heartbeat_s=0.5, position_s=0.3, stale_s=0.5, hold_s=0.1),
+    watchdogs=Watchdogs(heartbeat_s=1.5, position_s=1.0, stale_s=3.0, hold_s=0.1),  # a loaded machine pauses for long
 )  # fmt: skip
 
 
@@ -217,7 +217,7 @@ def test_a_takeover_while_it_holds_is_not_overruled(live):
 
     def stall(flight, link):
         reached(flight, link, seconds=0.3)
-        flight.control._on_stale()
+        flight.control._on_stale(0.5)
         reached(flight, link, "hold", 0.5)
         link.change(Mode.OTHER)
 
@@ -316,3 +316,24 @@ def test_stopping_twice_does_not_leave_the_vehicle_in_the_air(live, monkeypatch)
         flown(live, link, during=user)
     assert link.asked[-1] == "request land"
     assert link.mode is Mode.LAND
+
+
+def test_what_no_autopilot_takes_is_refused_on_the_ground(live, monkeypatch):
+    def refused(command):
+        raise LinkError("the policy commands attitudes")
+
+    monkeypatch.setattr("swarmsim.autopilot.flight.setpoint_of", refused)
+    link = FakeLink()
+    _, error, _ = flown(live, link)
+    assert "attitudes" in str(error)
+    assert "arm" not in link.asked
+    assert not link.sent
+
+
+def test_a_phase_that_is_over_before_the_take_off_is_not_flown(live, monkeypatch):
+    link, phases = FakeLink(), iter([0])
+    monkeypatch.setattr(live, "phase", lambda: next(phases, None))  # there when it begins, and done at once
+    monkeypatch.setattr(live, "over_without_vehicle", lambda: True)
+    _, error, _ = flown(live, link)
+    assert error is None
+    assert link.asked == ["preflight"]

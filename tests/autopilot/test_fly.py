@@ -5,18 +5,21 @@ import socket
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from swarmsim.autopilot.flown import FlownLog
 from swarmsim.autopilot.standin.kinematic import KinematicBody
 from swarmsim.autopilot.standin.settings import load_settings
 from swarmsim.autopilot.standin.sockets import open_link
 from swarmsim.autopilot.standin.vehicle import Standin
 from swarmsim.cli.entry import main
-from swarmsim.cli.fly import _free
+from swarmsim.cli.fly import EXIT_FLIGHT, _free, _outcome
 from tests.autopilot.ports import free_port
 
 BLOCK = """
@@ -179,3 +182,12 @@ def test_the_log_of_an_earlier_flight_is_not_written_over(tmp_path):
     log.write_bytes(b"why it came down")
     (tmp_path / "recon_uav1-2.tlog").touch()
     assert _free(log) == tmp_path / "recon_uav1-3.tlog"
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(ZeroDivisionError("a fault in a policy"), EXIT_FLIGHT), (KeyboardInterrupt(), 0)]
+)
+def test_whatever_ends_a_flight_its_results_are_written_first(error, code):
+    flight = SimpleNamespace(log=FlownLog(), fly=Mock(side_effect=error))
+    assert _outcome(flight, nullcontext()) == (code, error)
+    assert flight.log.ended == ("stopped by the user" if not code else f"an error of the program: {error!r}")

@@ -116,4 +116,7 @@ def test_the_flown_track_has_what_was_measured():
     track = flown_track(log)
     assert track.time_s.tolist() == [0.0, 0.1]
     assert track.position_m[1].tolist() == [1.5, 2.0, 3.0]
+    log.row(0.15, setpoint, Telemetry(position_m=(9.0, 9.0, 9.0)), lambda: None, by_hand=True)
+    assert flown_track(log).time_s.tolist() == [0.0, 0.1, 0.15]
+    assert flown_track(log, by_hand=False).time_s.tolist() == [0.0, 0.1]
     assert len(flown_track(FlownLog()).time_s) == 0
