@@ -56,7 +56,7 @@ class Control:
         self._stuck: threading.Timer | None = None  # acts for the thread of the flight if that does not
         self._lock = threading.Lock()
         self._mode: Mode | None = None  # the mode that we brought about; another one is somebody else's
-        self._armed = False  # we armed it
+        self._armed = False  # we armed it, or it took off for us
         self._last: Setpoint | None = None
         self._ended_s = 0.0  # when the autopilot was asked to end
 
@@ -113,11 +113,13 @@ class Control:
         link.follow(s.answer_s)
         self._mode = Mode.FOLLOW
         link.arm(s.answer_s)
-        self._armed = True
-        if self.flies and self.watch():  # an operator may have taken over while it armed
+        self._armed = link.arms
+        self.on_telemetry(link.telemetry())  # an operator may have taken over while it armed
+        if self.flies and self.watch():
             self._stage("take off")
             if not link.streams_first:
                 link.take_off(height, s.take_off_s)
+            self._armed = True
             self._climb(above_m[2] - (1.0 - CLIMBED) * height, above_m[2] - height, s.take_off_s)
         if self.alarm is None and not link.streams_first:
             self.stream.resume()

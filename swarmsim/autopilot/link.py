@@ -89,6 +89,8 @@ class VehicleLink(Protocol):
     """Whether nothing is sent that moves the vehicle."""
     streams_first: bool
     """Whether setpoints must be streamed before it follows them; it then takes off by setpoints as well."""
+    arms: bool
+    """Whether arming starts its motors; otherwise take-off does, and it tells that it is armed from then on."""
 
     def telemetry(self) -> Telemetry:
         """The latest that is known; any thread may ask."""

@@ -53,6 +53,7 @@ class SimulatedLink:
 
     dry = False
     streams_first = False
+    arms = True
 
     def __init__(self, body: Body, manners: SimulatedManners):
         """The body stands, disarmed; the thread runs at once."""

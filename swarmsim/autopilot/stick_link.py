@@ -87,6 +87,7 @@ class StickLink(ABC):
     """
 
     streams_first = False
+    arms = True
 
     def __init__(self, identity: Identity, loop: LoopSettings, rate_hz: float, stale_s: float, dry: bool):
         """``stale_s`` is how old a setpoint may be; with ``dry`` nothing is sent that moves the vehicle."""

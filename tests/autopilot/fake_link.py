@@ -16,7 +16,7 @@ class FakeLink:
 
     def __init__(self, *, streams_first: bool = True, flies: bool = True):
         self.identity = Identity("px4" if streams_first else "ardupilot", "copter" if flies else "rover", 1, 1)
-        self.streams_first, self.flies = streams_first, flies
+        self.streams_first, self.flies, self.arms = streams_first, flies, True
         self.place, self.velocity = np.zeros(3), np.zeros(3)
         self.armed, self.mode, self.failsafe, self.battery, self.estimate = False, Mode.HOLD, False, 0.9, True
         self.heard = self.posed = True

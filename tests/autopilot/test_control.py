@@ -53,6 +53,37 @@ def test_an_operator_who_takes_over_as_it_arms_is_not_overruled(link, monkeypatc
     assert control.state is State.RELEASED
 
 
+def take_off_alone(link, monkeypatch):
+    """The motors of an AR.Drone start with take-off: it has no arming."""
+    climbs = FakeLink.take_off
+
+    def take_off(height_m, timeout_s):
+        link.change(Mode.FOLLOW, armed=True)
+        climbs(link, height_m, timeout_s)
+
+    link.arms = False
+    monkeypatch.setattr(link, "arm", lambda timeout_s: None)
+    monkeypatch.setattr(link, "take_off", take_off)
+
+
+def test_a_vehicle_without_arming_is_not_taken_for_disarmed_before_it_takes_off(link, monkeypatch):
+    take_off_alone(link, monkeypatch)
+    control = controlled(link)
+    assert control.start(ABOVE_M, 0.0)
+    assert control.state is State.FOLLOWS
+    link.change(Mode.FOLLOW, armed=False)
+    assert "disarmed" in control.alarm.reason
+
+
+def test_a_vehicle_without_arming_that_an_operator_takes_does_not_take_off(link, monkeypatch):
+    take_off_alone(link, monkeypatch)
+    monkeypatch.setattr(link, "arm", lambda timeout_s: link.change(Mode.OTHER))
+    control = controlled(link)
+    assert not control.start(ABOVE_M, 0.0)
+    assert "take_off" not in link.asked
+    assert control.state is State.RELEASED
+
+
 @pytest.mark.parametrize(
     ("east_m", "ceiling_m", "reason"), [(150.0, 120.0, "outline"), (0.0, 1.0, "height")], ids=["outside", "too high"]
 )

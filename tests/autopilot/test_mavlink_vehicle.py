@@ -104,6 +104,7 @@ def test_a_wrong_link_string(tmp_path):
 
 def test_telemetry_in_the_world(linked):
     peer, vehicle = linked()
+    assert eventually(lambda: None not in (vehicle.telemetry().velocity_m_s, vehicle.telemetry().quaternion))
     told = vehicle.telemetry()
     assert told.position_m == pytest.approx((-2.0, 1.0, -0.5))
     assert told.velocity_m_s == pytest.approx((0.2, 0.1, -0.3))
@@ -114,7 +115,7 @@ def test_telemetry_in_the_world(linked):
     peer.position = [2.0, -2.0, -0.5]
     assert eventually(lambda: vehicle.telemetry().position_m == pytest.approx((100.0, 51.0, 6.0)))
     assert eventually(lambda: vehicle.telemetry().gnss_fix == 3 and vehicle.telemetry().estimate_ok)
-    assert (vehicle.telemetry().battery, vehicle.telemetry().on_ground) == (0.8, True)
+    assert eventually(lambda: (vehicle.telemetry().battery, vehicle.telemetry().on_ground) == (0.8, True))
 
 
 def test_numbers_that_are_not_finite_are_not_taken(linked):

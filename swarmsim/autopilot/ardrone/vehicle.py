@@ -39,6 +39,8 @@ class ArdroneVehicle(StickLink):
     application; what it then says stops this side at once.
     """
 
+    arms = False
+
     def __init__(
         self, host: str, settings: ArdroneSettings, *, log: Path | None = None, dry: bool = False,
         timeout_s: float = 10.0,

@@ -42,6 +42,8 @@ def moves(message: Message) -> bool:
 class MavlinkVehicle:
     """A PX4 or ArduPilot vehicle; a `VehicleLink`. The link is open, and the vehicle known, once it is made."""
 
+    arms = True
+
     def __init__(
         self,
         link: str,
