@@ -24,6 +24,7 @@ from swarmsim.results.places import geographic, places_of
 from swarmsim.results.spectra import SampleSpectra, sample_spectra
 from swarmsim.results.summary import summary
 from tests import synthetic
+from tests.results.n42_reader import FREE, NAME, channels, check_order, texts
 
 MISSION = """
 name: stand
@@ -43,36 +44,6 @@ extends: tarot_t650
 name: tube_t650
 detector: {model: geiger_sbm20, position_m: [0.0, 0.0, -0.1], axis: [0.0, 0.0, 1.0]}
 """
-# children in the order of the schema (ANSI N42.42-2012, n42.xsd 0.0.54 of NIST); ? may be absent, * many
-ORDER = {
-    "RadInstrumentData": "Remark* RadInstrumentDataCreatorName? RadInstrumentInformation RadDetectorInformation*",
-    "RadInstrumentInformation": "Remark* RadInstrumentManufacturerName RadInstrumentIdentifier? RadInstrumentModelName "
-    "RadInstrumentDescription? RadInstrumentClassCode RadInstrumentVersion*",
-    "RadInstrumentVersion": "RadInstrumentComponentName RadInstrumentComponentVersion",
-    "RadDetectorInformation": "Remark* RadDetectorName? RadDetectorCategoryCode RadDetectorKindCode "
-    "RadDetectorDescription? RadDetectorLengthValue? RadDetectorWidthValue? RadDetectorDepthValue? "
-    "RadDetectorDiameterValue?",
-    "EnergyCalibration": "Remark* CoefficientValues",
-    "FWHMCalibration": "Remark* EnergyValues FWHMValues",
-    "EnergyWindows": "Remark* WindowStartEnergyValues WindowEndEnergyValues",
-    "RadMeasurement": "Remark* MeasurementClassCode StartDateTime RealTimeDuration Spectrum* GrossCounts* DoseRate* "
-    "RadInstrumentState?",
-    "DerivedData": "Remark* MeasurementClassCode StartDateTime RealTimeDuration Spectrum*",
-    "Spectrum": "LiveTimeDuration ChannelData",
-    "GrossCounts": "LiveTimeDuration CountData",
-    "DoseRate": "DoseRateValue",
-    "RadInstrumentState": "StateVector",
-    "StateVector": "RelativeLocation",
-    "RelativeLocation": "RelativeLocationAzimuthValue RelativeLocationInclinationValue DistanceValue Origin",
-    "Origin": "OriginDescription",
-    "AnalysisResults": "AnalysisResultStatusCode AnalysisConfidenceValue AnalysisResultDescription "
-    "NuclideAnalysisResults?",
-    "NuclideAnalysisResults": "Nuclide*",
-    "Nuclide": "NuclideIdentifiedIndicator NuclideName NuclideIDConfidenceValue",
-}
-NAME = r"([^\W_]| )*\S+([^\W_]| )*"
-"""The schema's NonBlankStringSimpleType."""
-FREE = {"RadMeasurement", "DerivedData", "EnergyCalibration", "FWHMCalibration", "EnergyWindows", "AnalysisResults"}
 
 
 @pytest.fixture(scope="module")
@@ -115,24 +86,6 @@ def near(simulation: swarmsim.Simulation, record: swarmsim.MissionRecord) -> Sam
 def documents(run: Path) -> dict[str, ElementTree.Element]:
     assert main(["export-n42", str(run), "--start", "2026-05-04T09:30:00"]) == 0
     return {path.stem: ElementTree.parse(path).getroot() for path in (run / "n42").iterdir()}
-
-
-def named(tag: str) -> str:
-    return f"{{{NAMESPACE}}}{tag}"
-
-
-def texts(root: ElementTree.Element, path: str) -> list[str]:
-    return [found.text for found in root.findall("/".join(named(tag) for tag in path.split("/")))]
-
-
-def channels(text: str) -> np.ndarray:
-    """Counted zeroes, as a reader of the standard takes them."""
-    values = [int(word) for word in text.split()]
-    found: list[int] = []
-    while values:
-        value = values.pop(0)
-        found += [0] * values.pop(0) if value == 0 else [value]
-    return np.array(found)
 
 
 def test_every_exposure_is_logged_with_its_windows(record: swarmsim.MissionRecord) -> None:
@@ -241,17 +194,6 @@ def test_documents_follow_the_schema(documents: dict[str, ElementTree.Element]) 
             for name, value in element.attrib.items():
                 if name.endswith(("Reference", "References")):
                     assert set(value.split()) <= set(identifiers)
-
-
-def check_order(tag: str, children: list[str]) -> None:
-    """The children are those of the schema, in its order, and those it requires are there."""
-    rules = ORDER.get(tag, "").split()
-    names = [rule.rstrip("?*") for rule in rules]
-    places = [names.index(child) for child in children]
-    assert places == sorted(places), tag
-    for name, rule in zip(names, rules, strict=True):
-        if not rule.endswith(("?", "*")):
-            assert children.count(name) == 1, (tag, name)
 
 
 def test_documents_hold_the_counts(
