@@ -22,7 +22,7 @@ SURVEY = [
 ]  # fmt: skip
 QUICK = Autopilot(
     take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=10.0, land_s=20.0,
-    watchdogs=Watchdogs(heartbeat_s=1.5, position_s=1.0, stale_s=3.0, hold_s=0.1),  # a loaded machine pauses for long
+    watchdogs=Watchdogs(heartbeat_s=3.0, position_s=2.0, stale_s=3.0, hold_s=0.1),  # a loaded machine pauses
 )  # fmt: skip
 
 
