@@ -242,6 +242,8 @@ class Control:
                 self._stage(f"it has not told for {self.settings.land_s:g} s that it does: its own failsafe has to act")
                 return
             time.sleep(POLL_S)
+        if asked_s is not None:
+            self._stage(f"it is in mode {t.mode_name}{'' if t.armed else ', disarmed'}; nothing more is asked of it")
 
     # Inside
 

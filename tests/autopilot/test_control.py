@@ -28,9 +28,9 @@ def link():
     made.close()
 
 
-def controlled(link, settings=QUICK):
+def controlled(link, settings=QUICK, stage=lambda _: None):
     guard = Guard(limits=settings.limits, outline_m=OUTLINE_M, ground_m=0.0, flies=True)
-    control = Control(link, settings, guard, link.flies, lambda _: None)
+    control = Control(link, settings, guard, link.flies, stage)
     link.on_mode(control.on_telemetry)
     control.stream.start()
     return control
@@ -111,6 +111,14 @@ def test_a_landing_that_is_not_heard_of_is_asked_for_again(link, monkeypatch):
     monkeypatch.setattr(link, "request", lambda mode: None if next(lost) else told(link, mode))
     control.emergency()
     assert link.mode is Mode.LAND
+
+
+def test_what_an_emergency_brought_about_is_told(link):
+    told = []
+    control = controlled(link, stage=told.append)
+    assert control.start(ABOVE_M, 0.0)
+    control.emergency()
+    assert told[-1].startswith("it is in mode LAND")
 
 
 def test_an_operator_who_takes_over_in_an_emergency_is_not_overruled(link, monkeypatch):

@@ -92,7 +92,8 @@ class Peer:
     def _tell(self) -> None:
         self.boot_ms += 20
         mode = 0x81 if self.armed else 0x01
-        health = (PREARM if self.ready else 0) | 0xFF & ~self.ill
+        starved = self.autopilot == PX4 and self.custom_mode == OFFBOARD and not self.armed  # of setpoints
+        health = (PREARM if self.ready and not starved else 0) | 0xFF & ~self.ill
         self.send(mavlink.MAVLink_heartbeat_message(self.kind, self.autopilot, mode, self.custom_mode, self.status, 3))
         self.send(mavlink.MAVLink_local_position_ned_message(self.boot_ms, *self.position, 0.1, 0.2, 0.3))
         self.send(mavlink.MAVLink_attitude_quaternion_message(self.boot_ms, 1.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.03))

@@ -16,7 +16,7 @@ from swarmsim.autopilot.mavlink.vehicle import moves
 from swarmsim.config.errors import InputError
 from tests.autopilot import test_mavlink_peer as peers
 from tests.autopilot.ports import free_port
-from tests.autopilot.test_mavlink_peer import ARDUPILOT, COPTER, LOITER, POSITION, PX4, ROVER, eventually
+from tests.autopilot.test_mavlink_peer import ARDUPILOT, COPTER, LOITER, OFFBOARD, POSITION, PX4, ROVER, eventually
 
 SET_MODE, ARM, TAKEOFF = 176, 400, 22
 
@@ -276,6 +276,16 @@ def test_preflight_passes_and_tells(linked):
     assert any(text.startswith("GF_ACTION = 3:") for text in told)
     assert any(text.startswith("NAV_DLL_ACT = -1:") for text in told)
     assert any(text.startswith("estimate: ok") for text in told)
+
+
+def test_a_px4_that_stands_in_offboard_after_a_flight_can_be_flown_again(linked):
+    peer, vehicle = linked()
+    peer.custom_mode = OFFBOARD
+    assert eventually(lambda: vehicle.telemetry().mode is Mode.FOLLOW and vehicle.telemetry().ready_to_arm is False)
+    told: list[str] = []
+    vehicle.preflight(told.append, 10.0)
+    assert peer.custom_mode == LOITER
+    assert any("OFFBOARD since an earlier flight" in text for text in told)
 
 
 def test_preflight_gives_every_reason(linked):

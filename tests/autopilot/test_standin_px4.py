@@ -161,6 +161,26 @@ def test_take_off_land_and_disarm():
     assert bench.height == pytest.approx(0.0, abs=0.1)
 
 
+def test_after_a_flight_in_offboard_it_stands_in_offboard_and_is_not_ready():
+    bench = px4_flying()
+    bench.set_mode(4, 6)
+    bench.until(lambda: not bench.standin.armed, 20.0)
+    assert bench.advance(1.0).custom_mode == OFFBOARD
+    assert not bench.last("SYS_STATUS").onboard_control_sensors_health & mav.MAV_SYS_STATUS_PREARM_CHECK
+    bench.set_mode(4, 3)
+    bench.advance(1.0)
+    assert bench.last("SYS_STATUS").onboard_control_sensors_health & mav.MAV_SYS_STATUS_PREARM_CHECK
+
+
+def test_a_failsafe_is_over_when_it_is_disarmed():
+    bench = px4_flying()
+    bench.advance(3.0)
+    assert bench.standin.pilot.failsafe
+    bench.standin.disarm_unexpectedly()
+    assert bench.advance(0.5).custom_mode == OFFBOARD
+    assert not bench.standin.pilot.failsafe
+
+
 def test_return_flies_home_at_its_height_and_disarms():
     bench = px4_flying()
     bench.stream(15.0, position=(40.0, 30.0, -5.0))

@@ -53,8 +53,9 @@ def _estimate(heard: Heard, profile: Profile, now: float) -> Stage:
     if heard.estimate_ok:
         return Stage("estimate", note=f"flags {flags:#x}")
     lacks = [name for i, name in enumerate(_FLAGS) if name and rules.needed & ~flags & 1 << i]
-    lacks += ["nothing, but it reports an error"] if flags & rules.forbidden else []
-    return Stage("estimate", f"the state estimate lacks {', '.join(lacks)} (flags {flags:#x}): keep still and wait")
+    told = [f"lacks {', '.join(lacks)}"] if lacks else []
+    told += ["reports an error"] if flags & rules.forbidden else []
+    return Stage("estimate", f"the state estimate {' and '.join(told)} (flags {flags:#x}): keep still and wait")
 
 
 def _pose(heard: Heard, profile: Profile, now: float) -> Stage:

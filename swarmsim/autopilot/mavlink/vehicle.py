@@ -139,7 +139,14 @@ class MavlinkVehicle:
     # what it is told
 
     def preflight(self, tell: Callable[[str], None], timeout_s: float) -> None:
-        """Wait until it can be armed, telling what passes; raises `LinkError` with every reason when time is up."""
+        """Wait until it can be armed, telling what passes; raises `LinkError` with every reason when time is up.
+
+        A PX4 goes back to OFFBOARD when it has landed, and passes no pre-arm check there while nothing is streamed.
+        """
+        before = self._heard
+        if self.streams_first and before.armed is False and before.mode is Mode.FOLLOW:
+            tell(f"it stands in {before.mode_name} since an earlier flight: asking for hold")
+            self.request(Mode.HOLD)
 
         def check_now() -> None:
             if self._profile.autopilot.runs_prearm_checks:

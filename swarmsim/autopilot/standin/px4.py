@@ -20,6 +20,7 @@ _MODES = {
     "AUTO.LAND": (4, 6, "land"),
     "OFFBOARD": (6, 0, "follow"),
 }
+_ENDS = ("land", "return")  # roles in which it cannot be armed
 ACCEPTED, REJECTED, DENIED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_TEMPORARILY_REJECTED, mav.MAV_RESULT_DENIED
 
 
@@ -35,6 +36,7 @@ class PX4(Autopilot):
         """As every autopilot."""
         super().__init__(*arguments, **fields)
         self.intention = self.mode  # what was commanded; the mode may differ in a failsafe
+        self._armable = self.mode  # the last one commanded that it can be armed in: it stands in it after a flight
         self.target: Target | None = None
         self._last_s = -math.inf  # of the stream's setpoints
         self._since_s = math.inf
@@ -47,6 +49,11 @@ class PX4(Autopilot):
     def boot_mode(self) -> str:
         """HOLD: there is no remote control."""
         return "AUTO.LOITER"
+
+    @property
+    def ready(self) -> bool:
+        """Not in OFFBOARD without a stream."""
+        return super().ready and (self.armed or self.mode != "OFFBOARD" or self.streams_setpoints)
 
     @property
     def streams_setpoints(self) -> bool:
@@ -85,6 +92,8 @@ class PX4(Autopilot):
         if self.roles[name] in ("takeoff", "return") and not self.estimate_ok:
             return [ACCEPTED, REJECTED]
         self.intention, self.failsafe = name, False
+        if self.roles[name] not in _ENDS:
+            self._armable = name
         if self.mode != name or name == "AUTO.TAKEOFF":
             self.enter(name)
         return [ACCEPTED, ACCEPTED]
@@ -155,6 +164,13 @@ class PX4(Autopilot):
     def return_height_m(self) -> tuple[float, float]:
         """RTL_RETURN_ALT; it does not wait."""
         return float(self.parameters["RTL_RETURN_ALT"]), 0.0
+
+    def disarm(self) -> None:
+        """Stop the motors; a landing or a return is over, and a failsafe."""
+        super().disarm()
+        if self.role in _ENDS or self.failsafe:
+            self.mode = self.intention = self._armable
+            self.failsafe = False
 
     def disarm_command(self, command: Command) -> int:
         """Refused in the air, unless forced."""
