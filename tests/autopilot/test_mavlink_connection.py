@@ -5,6 +5,7 @@ import os
 import secrets
 import select
 import socket
+import threading
 import time
 import tty
 
@@ -87,7 +88,7 @@ def test_links_that_cannot_be_opened():
         port = taken.getsockname()[1]
         with pytest.raises(LinkError, match="another program"):
             Connection(f"udpin:{port}", print)
-    with pytest.raises(LinkError, match="start the autopilot first"):
+    with pytest.raises(LinkError, match="start the autopilot"):
         Connection(f"tcp:{port}", print)
     with pytest.raises(LinkError, match="plugged in"):
         Connection("serial:/dev/there-is-none:57600", print)
@@ -275,6 +276,16 @@ def test_a_tcp_link_comes_back():
                     assert Protocol(7, 1).messages_of(peer.recv(100), False)[0]
         finally:
             connection.close()
+
+
+def test_a_tcp_server_that_starts_later_is_waited_for():
+    port, made = free_port(socket.SOCK_STREAM), []
+    later = threading.Timer(0.6, lambda: made.append(socket.create_server(("127.0.0.1", port))))
+    later.start()
+    connection = Connection(f"tcp:{port}", print, refused_s=20.0)
+    connection.close()
+    later.join()
+    made[0].close()
 
 
 def test_a_link_that_waits_for_tcp():

@@ -55,6 +55,7 @@ class Connection:
         heartbeat_hz: float = 1.0,
         log: Path | None = None,
         key: bytes | None = None,
+        refused_s: float = 0.0,
     ):
         """Open ``link`` and begin to read and to send heartbeats as system and component ``own``.
 
@@ -79,7 +80,7 @@ class Connection:
         self._count_lock, self._send_lock, self._log_lock = threading.Lock(), threading.Lock(), threading.Lock()
         self._log: BinaryIO | None = None
         self._closed = threading.Event()
-        self._transport = open_transport(address)
+        self._transport = open_transport(address, refused_s)
         if log is not None:
             try:
                 with file_errors_told("the log cannot be written", file=log):

@@ -20,6 +20,7 @@ _READ_BYTES = 65_536
 _BUFFER_BYTES = 1 << 20  # of the socket: half a second of everything that a PX4 tells
 _RECONNECT_S = 1.0
 _CONNECT_S = 2.0
+_REFUSED_S = 0.25
 _STUCK_S = 0.5  # a TCP peer that takes nothing for this long is given up
 _BAUD = 57_600
 
@@ -68,25 +69,42 @@ class Transport(Protocol):
         """Close for good."""
 
 
-def open_transport(address: LinkAddress) -> Transport:
-    """Open the link; raises `LinkError` that says what to do when it cannot be opened."""
-    try:
-        if address.kind in ("udpin", "udpout"):
-            return _Udp(address)
-        if address.kind == "tcp":
-            return _TcpClient(address)
-        if address.kind == "tcpin":
-            return _TcpServer(address)
-        return _Serial(address)
-    except OSError as error:
-        advice = {
-            "udpin": "another program may listen there already: give this vehicle a port of its own",
-            "tcpin": "another program may listen there already: give this vehicle a port of its own",
-            "udpout": "check the host name",
-            "tcp": "start the autopilot first, and check that no other client is connected to this port",
-            "serial": "check that the device is plugged in and that you may read it (group dialout)",
-        }[address.kind]
-        raise LinkError(f"{address} cannot be opened ({error.strerror or error}): {advice}") from error
+def open_transport(address: LinkAddress, refused_s: float = 0.0) -> Transport:
+    """Open the link; raises `LinkError` that says what to do when it cannot be opened.
+
+    A TCP server that does not listen yet is tried for ``refused_s``: an autopilot takes seconds to start.
+    """
+    end = time.monotonic() + refused_s
+    while True:
+        try:
+            return _opened(address)
+        except ConnectionRefusedError as error:
+            if time.monotonic() > end:
+                raise _cannot_open(address, error) from error
+            time.sleep(_REFUSED_S)
+        except OSError as error:
+            raise _cannot_open(address, error) from error
+
+
+def _opened(address: LinkAddress) -> Transport:
+    if address.kind in ("udpin", "udpout"):
+        return _Udp(address)
+    if address.kind == "tcp":
+        return _TcpClient(address)
+    if address.kind == "tcpin":
+        return _TcpServer(address)
+    return _Serial(address)
+
+
+def _cannot_open(address: LinkAddress, error: OSError) -> LinkError:
+    advice = {
+        "udpin": "another program may listen there already: give this vehicle a port of its own",
+        "tcpin": "another program may listen there already: give this vehicle a port of its own",
+        "udpout": "check the host name",
+        "tcp": "start the autopilot, and check that no other client is connected to this port",
+        "serial": "check that the device is plugged in and that you may read it (group dialout)",
+    }[address.kind]
+    return LinkError(f"{address} cannot be opened ({error.strerror or error}): {advice}")
 
 
 def _family(host: str) -> socket.AddressFamily:

@@ -82,7 +82,13 @@ class MavlinkVehicle:
         discovery = Discovery(system, component)
         self._receive: Callable[[Message], None] = discovery.hear
         self._connection = Connection(
-            link, lambda message: self._receive(message), own=own, heartbeat_hz=heartbeat_hz, log=log, key=key
+            link,
+            lambda message: self._receive(message),
+            own=own,
+            heartbeat_hz=heartbeat_hz,
+            log=log,
+            key=key,
+            refused_s=timeout_s,
         )
         try:
             found = discovery.wait(self._connection, timeout_s)
