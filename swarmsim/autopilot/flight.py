@@ -230,6 +230,8 @@ class Flight:
         if alarm is not None and not self._left:
             self.live.leave()
             self._left = True
+            if not self.live.over_without_vehicle():
+                self._tell("its part of the mission is over; the other vehicles go on until Ctrl-C or their end")
         elif self.control.state is not State.FOLLOWS and not self._wanted and not self.live.has_phase_to_come():
             self._left = True
         if self.helm is not None:

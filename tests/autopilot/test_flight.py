@@ -211,6 +211,21 @@ def test_a_takeover_in_the_climb_is_seen_at_once(live):
     assert link.asked[-1] == "arm"
 
 
+def test_that_the_others_go_on_after_a_takeover_is_told(live, monkeypatch):
+    link = FakeLink()
+    answers = iter([False, False])
+    monkeypatch.setattr(live, "over_without_vehicle", lambda: next(answers, True))
+
+    def operator(flight, link):
+        reached(flight, link)
+        link.change(Mode.OTHER)
+
+    _, error, told = flown(live, link, during=operator)
+    assert error is None
+    assert "the operator took over" in told[-2]
+    assert "the other vehicles go on" in told[-1]
+
+
 def test_a_takeover_while_it_holds_is_not_overruled(live):
     link = FakeLink()
     dogs = QUICK.watchdogs.model_copy(update={"hold_s": 3.0})

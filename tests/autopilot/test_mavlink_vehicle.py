@@ -314,6 +314,23 @@ def test_preflight_gives_every_reason(linked):
     assert any("FS_GCS_ENABLE" in text or "ARMING_CHECK was not told" in text for text in told)
 
 
+def test_a_link_that_is_lost_in_preflight_is_told_once(linked):
+    peer, vehicle = linked()
+    peer.close()
+    told: list[str] = []
+    with pytest.raises(LinkError, match="no heartbeat comes any more"):
+        vehicle.preflight(told.append, 9.0)
+    assert sum(text.startswith("link: no heartbeat") for text in told) == 1
+
+
+def test_the_estimators_lacks_and_errors_are_told_apart(linked):
+    peer, vehicle = linked({"autopilot": ARDUPILOT})
+    peer.flags = 0xA7
+    assert eventually(lambda: vehicle.telemetry().estimate_ok is False)
+    with pytest.raises(LinkError, match=r"lacks absolute position and reports an error \(flags 0xa7\)"):
+        vehicle.preflight(lambda _: None, 0.5)
+
+
 def test_close_twice_and_the_log(linked, tmp_path):
     log = tmp_path / "logs" / "flight.tlog"
     peer, vehicle = linked(wanted={"log": log})

@@ -30,7 +30,7 @@ def stages(heard: Heard, profile: Profile, now: float) -> list[Stage]:
 
 def _link(heard: Heard, profile: Profile, now: float) -> Stage:
     if heard.heard_s is None or now - heard.heard_s > FRESH_S:
-        silent = "ever" if heard.heard_s is None else f"for {now - heard.heard_s:.1f} s"
+        silent = "has come" if heard.heard_s is None else f"comes any more, for over {FRESH_S:g} s"
         return Stage("link", f"no heartbeat {silent}: check cable, radio, port and power")
     return Stage("link", note=f"{profile.autopilot.name} {profile.vehicle}, mode {heard.mode_name}")
 
