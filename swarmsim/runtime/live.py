@@ -16,6 +16,7 @@ from swarmsim.missions.segment import decided
 from swarmsim.missions.state import MissionState, Signals
 from swarmsim.runtime.progress import Progress, SilentProgress
 from swarmsim.runtime.simulation import MissionBatch, MissionRun, Segment, Simulation, with_clock, without_clock
+from swarmsim.runtime.uninterrupted import uninterrupted
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world.build import grouped
 from swarmsim.world.model import World
@@ -90,9 +91,10 @@ class LiveMission:
         """Begin the phases that are due, and return their names; one that estimates a source takes seconds."""
         begun = []
         for number in self._due:
-            self._mission = self._batch.run(
-                **self._run.beginning(int(number), self._mission, self._tick, np.ones(1, bool))
-            )
+            with uninterrupted():
+                self._mission = self._batch.run(
+                    **self._run.beginning(int(number), self._mission, self._tick, np.ones(1, bool))
+                )
             begun.append(self._simulation.plan.phases[number].name)
         self._due = np.array([], int)
         return tuple(begun)
@@ -156,6 +158,7 @@ class LiveMission:
         rank = rank_of(self._simulation.plan.phases[number], self.seat)
         return None if rank is None else np.array(self._mission.phases[number].path.points_m)[0, rank]  # type: ignore[union-attr]
 
+    @uninterrupted()
     def step(self, body: RigidState, battery: float) -> LiveStep:
         """The mission one judging period later, with the vehicle where it was measured (``body``)."""
         measured = jax.tree.map(partial(np.asarray, dtype=np.float32), Measured(body=body, battery=battery))
@@ -184,6 +187,7 @@ class LiveMission:
             in_phase=bool(np.asarray(inside)[0]),
         )
 
+    @uninterrupted()
     def join(self, body: RigidState, within_m: float) -> None:
         """Let the vehicle's references go on from where its paths pass ``body``, within that length from now."""
         self._mission = self._batch.run(
@@ -191,6 +195,7 @@ class LiveMission:
             (np.asarray(body.position_m, np.float32), np.float32(within_m), np.int32(self._tick)), donate=True,
         )  # fmt: skip
 
+    @uninterrupted()
     def leave(self) -> None:
         """The vehicle has no further part in the mission; the rest of the team goes on."""
         self._mission = self._batch.run(

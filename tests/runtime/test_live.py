@@ -1,5 +1,6 @@
 """A mission in real time with a vehicle outside, against the same mission rolled out."""
 
+import signal
 from dataclasses import replace
 
 import jax
@@ -85,6 +86,24 @@ def test_a_vehicle_that_leaves_lets_the_mission_go_on(simulation):
         over = step.over
         assert live.time_s < 150.0
     assert begun == ["drive"]
+
+
+def test_ctrl_c_within_a_step_leaves_a_mission_that_can_be_written(simulation, monkeypatch):
+    live = LiveMission(simulation, 3, "uav1")
+    live.start()
+    live.begin_phases()
+    run = live._batch.run
+
+    def interrupted(*arguments, **named):
+        made = run(*arguments, **named)
+        signal.raise_signal(signal.SIGINT)
+        return made
+
+    with monkeypatch.context() as patched:
+        patched.setattr(live._batch, "run", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            live.step(live.body(), 0.9)
+    assert np.isfinite(np.asarray(live.result().end.over_s)).all()
 
 
 def test_an_unknown_vehicle_is_refused(simulation):
