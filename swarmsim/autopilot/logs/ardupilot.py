@@ -146,6 +146,7 @@ def _with_the_rest(found: Collected, messages: dict[str, Messages], profile: Pro
     if "BAT" in messages:
         battery = messages["BAT"]
         battery = battery.where(battery.numbers("Inst") == 0) if battery.has("Inst") else battery
+        battery = battery.where(battery.numbers("RemPct") <= 100.0)  # 255 where it is not known
         found.battery = Series(_seconds(battery), battery.numbers("RemPct") / 100.0)
     found.setpoints_ned_m = _targets(messages)
     return found

@@ -75,7 +75,8 @@ class Messages:
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column [n] in the unit of its format."""
-        return np.asarray(self.rows[name], np.float64) * self.factors[name]
+        with np.errstate(invalid="ignore"):  # damage may leave a signalling NaN
+            return np.asarray(self.rows[name], np.float64) * self.factors[name]
 
     def texts(self, name: str) -> list[str]:
         """A column of texts [n]."""
@@ -108,9 +109,8 @@ def read_messages(data: Data, names: set[str]) -> tuple[dict[str, Messages], int
             continue
         if kind == _FMT:
             number, made = _format(data[position + _HEADER_BYTES : after])
-            if made is not None:
-                lengths[number], formats[number] = made.length, made
-                places.setdefault(number, [])
+            if made is not None and not places.get(number):  # what has been found was of the format told before
+                lengths[number], formats[number], places[number] = made.length, made, []
         elif formats[kind].name in names:
             places[kind].append(position)
         position = after

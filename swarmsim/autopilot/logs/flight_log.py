@@ -15,10 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 from swarmsim.autopilot.frames import Geodetic, enu_of_ned, moved_origin, quaternion_enu_of_ned
 from swarmsim.autopilot.link import LinkError
 from swarmsim.autopilot.mavlink.profile import AUTOPILOTS, Profile, detect_profile, load_autopilot
+from swarmsim.config.errors import InputError
 
 Floats = NDArray[np.float64]
 Format = Literal["tlog", "bin", "ulg"]
 STALE_S = 1.0  # an attitude older than this is not that of a position
+BACK_S = 1.0  # positions that are told in another order than they were taken lie less apart
 UNKNOWN = "unknown"
 _NEIGHBOURS = 7  # positions by which one is judged
 _FAR_S, _FAR_M = 60.0, 100.0
@@ -135,7 +137,7 @@ def assembled(
 ) -> FlightLog:
     """The flight that was collected: in ENU and FLU, in order of time, which begins with the first position.
 
-    Of positions at the same time the last counts. Raises `ValueError` where there is none.
+    Of positions at the same time the last counts. Raises `InputError` where there is none.
     """
     notes = list(notes)
     known = np.isfinite(found.position_ned_m).all(axis=1)
@@ -144,7 +146,12 @@ def assembled(
         notes.append(f"{known.sum() - len(sound)} positions are far from those before and after them: left out")
     order = sound[_increasing(found.time_s[sound])]
     if not len(order):
-        raise ValueError("no position")
+        raise InputError.of(
+            "the log holds no position that makes sense", suggestion="the vehicle had no position estimate"
+        )
+    back = int((np.diff(found.time_s[sound]) < -BACK_S).sum())
+    if back:
+        notes.append(f"times go back ({back} x): the log is damaged, or flights after one another lie over each other")
     start = float(found.time_s[order[0]])
     time_s = found.time_s[order] - start
     battery = _ordered(found.battery or Series(np.zeros(0), np.zeros(0)))

@@ -138,7 +138,7 @@ def _track(topic: Topic) -> Collected | None:
     if not valid.any():
         return None
     position, origin = _vectors(topic, "x", "y", "z"), None
-    position[~valid] = np.nan
+    position[~(valid & np.isfinite(position).all(axis=1))] = np.nan
     if _has(topic, "ref_lat", "ref_lon", "ref_alt"):
         places = _vectors(topic, "ref_lat", "ref_lon", "ref_alt")
         known = np.isfinite(places).all(axis=1) & (np.abs(places[:, :2]).sum(axis=1) > 0.0)

@@ -1,6 +1,7 @@
 """MAVLink telemetry logs (``.tlog``): before each message the time of its reception, 8 bytes, microseconds since 1970.
 
-A log holds what several systems said. Positions and attitudes are put on the vehicle's own clock
+A log holds what several systems said, each with several components: gimbals and companion computers tell attitudes by
+clocks of their own. Positions and attitudes are put on the vehicle's own clock
 (``time_boot_ms``), which radio links do not delay: their offset from the times of reception is taken as its median
 since the vehicle was switched on.
 """
@@ -40,6 +41,7 @@ _POSITION_IGNORED = 0x7  # of SET_POSITION_TARGET_LOCAL_NED.type_mask
 _LOCAL_FRAME = mavlink.MAV_FRAME_LOCAL_NED
 _V1, _V2 = mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2
 _SIGNATURE_BYTES = 13
+_AUTOPILOT = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 
 @dataclass
@@ -78,21 +80,32 @@ def read_tlog(data: Data, system: int | None) -> FlightLog:
     Raises `InputError` where there is no such one, where there are several and none is chosen, and where it told no
     position.
     """
-    scan, vehicles = _Scan(), dict[int, _Told]()
+    scan, heard = _Scan(), dict[tuple[int, int], _Told]()
     commanded: dict[int, list[tuple[float, ...]]] = {}
     parser = mavlink.MAVLink(None)
     for when, sender, message in _messages(data, scan, parser):
-        _hear(vehicles, commanded, when, sender, message)
-    known = {number: told for number, told in vehicles.items() if told.kind is not None or told.local or told.globe}
+        _hear(heard, commanded, when, sender, message)
+    known = _vehicles(heard)
     chosen = _chosen(known, system)
     told = known[chosen]
     notes = []
     if scan.skipped or scan.wrong:
         notes.append(f"{scan.skipped} bytes are no messages, {scan.wrong} messages have a wrong checksum: skipped")
     found = _collected(told, commanded.get(chosen, []), notes)
-    if not len(found.time_s):
+    if not np.isfinite(found.position_ned_m).all(axis=1).any():
         raise InputError.of(f"system {chosen} told no position in this log")
     return assembled(found, "tlog", told.profile, told.autopilot, chosen, notes)
+
+
+def _vehicles(heard: dict[tuple[int, int], _Told]) -> dict[int, _Told]:
+    """Of each system the component that flies it: that with an autopilot's heartbeat, else the one with positions."""
+    known: dict[int, _Told] = {}
+    for (system, _), told in sorted(heard.items(), key=lambda pair: (pair[0][1] != _AUTOPILOT, pair[0])):
+        if told.kind is None and not (told.local or told.globe):
+            continue
+        if system not in known or (known[system].kind is None and told.kind is not None):
+            known[system] = told
+    return known
 
 
 def _chosen(known: dict[int, _Told], system: int | None) -> int:
@@ -109,8 +122,8 @@ def _chosen(known: dict[int, _Told], system: int | None) -> int:
     return system if system is not None else next(iter(known))
 
 
-def _messages(data: Data, scan: _Scan, parser: Any) -> Iterator[tuple[float, int, Any]]:
-    """Time of reception in s, system id and message, for the messages that are understood here."""
+def _messages(data: Data, scan: _Scan, parser: Any) -> Iterator[tuple[float, tuple[int, int], Any]]:
+    """Time of reception in s, ids of system and component, and message, for the messages that are understood here."""
     position, size = 0, len(data)
     while position + 8 < size:
         length = _frame(data, position, size)
@@ -132,7 +145,8 @@ def _messages(data: Data, scan: _Scan, parser: Any) -> Iterator[tuple[float, int
         except Exception:  # whatever hostile bytes do to pymavlink, the reading goes on
             scan.wrong += 1
             continue
-        yield _STAMP.unpack_from(data, start - 8)[0] * 1e-6, data[start + (5 if two else 3)], message
+        sender = start + (5 if two else 3)
+        yield _STAMP.unpack_from(data, start - 8)[0] * 1e-6, (data[sender], data[sender + 1]), message
     scan.skipped += max(0, size - position)
 
 
@@ -154,11 +168,15 @@ def _frame(data: Data, position: int, size: int) -> int:
 
 def _next_frame(data: Data, position: int, size: int) -> int:
     """Where the next whole message begins that is followed by another one, or by the end."""
+    at = dict.fromkeys((_V1, _V2), -1)  # where each marker comes next: it is looked for once
     while True:
-        markers = [at for at in (data.find(bytes([m]), position + 8) for m in (_V1, _V2)) if at >= 0]
-        if not markers:
+        for marker, place in at.items():
+            if place < position + 8:
+                found = data.find(bytes([marker]), position + 8)
+                at[marker] = found if found >= 0 else size
+        if min(at.values()) == size:
             return size
-        position = min(markers) - 8
+        position = min(at.values()) - 8
         length = _frame(data, position, size)
         after = position + 8 + length
         if length and (after == size or _frame(data, after, size)):
@@ -167,13 +185,14 @@ def _next_frame(data: Data, position: int, size: int) -> int:
 
 
 def _hear(
-    vehicles: dict[int, _Told], commanded: dict[int, list[tuple[float, ...]]], when: float, sender: int, m: Any
-) -> None:
+    heard: dict[tuple[int, int], _Told], commanded: dict[int, list[tuple[float, ...]]], when: float,
+    sender: tuple[int, int], m: Any,
+) -> None:  # fmt: skip
     if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
         if m.coordinate_frame == _LOCAL_FRAME and not m.type_mask & _POSITION_IGNORED:
             commanded.setdefault(m.target_system, []).append((when, m.x, m.y, m.z))
         return
-    _READERS[m.get_type()](vehicles.setdefault(sender, _Told()), when, m)
+    _READERS[m.get_type()](heard.setdefault(sender, _Told()), when, m)
 
 
 def _tick(told: _Told, when: float, boot_ms: int) -> float:

@@ -250,3 +250,63 @@ def test_a_rover_of_ardupilot(tmp_path):
     log = read(tmp_path, "bin", writers.dataflash(TRUTH, "ArduRover"))
     assert log.vehicle == "rover"
     assert log.modes[1].name == "HOLD"  # 4, which is GUIDED of a copter
+
+
+def test_a_gimbal_of_the_same_system_is_not_taken_for_the_vehicle(tmp_path):
+    """It tells an attitude and a clock of its own."""
+    gimbal = writers.Tlog(1)
+    gimbal.link.srcComponent = mavlink.MAV_COMP_ID_GIMBAL
+    messages, place = bytearray(), 0
+    for k in range(400):
+        length = 8 + 12 + WRITTEN["tlog"][place + 9]
+        messages += WRITTEN["tlog"][place : place + length]
+        place += length
+        gimbal.data.clear()
+        gimbal.put(0.07 * k, mavlink.MAVLink_attitude_message(70 * k, 0.5, -0.9, 1.2, 0, 0, 0))
+        messages += gimbal.data
+    log = read(tmp_path, "tlog", bytes(messages + WRITTEN["tlog"][place:]))
+    assert log.notes == ()
+    np.testing.assert_allclose(log.time_s, TRUTH.time_s, atol=1e-3)
+    turned = np.abs(np.sum(log.quaternion * TRUTH.quaternion, axis=1))
+    np.testing.assert_allclose(turned, 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", WRITTEN)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_positions_that_are_no_numbers(kind, value, tmp_path):
+    write = {"tlog": writers.tlog, "bin": writers.dataflash, "ulg": writers.ulog}[kind]
+    position = TRUTH.position_m.copy()
+    position[::7] = value
+    log = read(tmp_path, kind, write(writers.Truth(TRUTH.time_s, position, TRUTH.velocity_m_s, TRUTH.quaternion)))
+    assert len(log.time_s) == 257
+    position[:] = value
+    with pytest.raises(InputError, match="position"):
+        read(tmp_path, kind, write(writers.Truth(TRUTH.time_s, position, TRUTH.velocity_m_s, TRUTH.quaternion)))
+
+
+def test_a_format_that_is_told_again_otherwise_does_not_change_what_was_read(tmp_path):
+    columns = b"TimeUS,C,VN,VE,VD,PN,PE,PD,a,b"
+    again = b"\xa3\x95\x80" + bytes([136, 3 + 33 + 128]) + b"XKF1" + b"QBffffffZZ".ljust(16, b"\0")
+    log = read(tmp_path, "bin", WRITTEN["bin"] + again + columns.ljust(64, b"\0"))
+    np.testing.assert_allclose(log.position_m, TRUTH.position_m, atol=1e-5)
+
+
+def test_times_that_go_back_are_told(tmp_path):
+    log = read(tmp_path, "bin", WRITTEN["bin"] * 2)
+    assert len(log.time_s) == 300
+    assert any("times go back" in note for note in log.notes)
+
+
+def test_a_battery_that_tells_no_share(tmp_path):
+    """ArduPilot writes 255 where it does not know."""
+    data = bytearray(WRITTEN["bin"])
+    place = -1
+    while (place := data.find(b"\xa3\x95\x8a", place + 1)) >= 0:
+        data[place + 12] = 255
+    assert len(read(tmp_path, "bin", bytes(data)).battery.values) == 0
+
+
+def test_long_stretches_of_one_marker_do_not_take_for_ever(tmp_path):
+    """The other marker is looked for once: again for each of them it would be hours."""
+    log = read(tmp_path, "tlog", WRITTEN["tlog"] + b"\xfd" * 1_000_000)
+    assert len(log.time_s) == 300
