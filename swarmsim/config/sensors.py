@@ -1,9 +1,9 @@
 """Navigation sensors as a user writes them (``configs/sensors/<name>.yaml``): the figures of their data sheets.
 
 A noise density is the N of IEEE Std 952-1997, annex C: white noise of two-sided power density N^2, so that a sample
-that stands for T s has the standard deviation N / sqrt(T) and the Allan deviation is N / sqrt(tau). Of a data sheet
-whose density is one-sided the model therefore makes noise that is larger by sqrt(2). Every ``*_std_*`` is one standard
-deviation of what is drawn anew whenever the sensor is switched on. What is not given is left out.
+that stands for T s has the standard deviation N / sqrt(T) and the Allan deviation is N / sqrt(tau). The density D of a
+data sheet is one-sided wherever the noise in a bandwidth B is D sqrt(B): N is then D / sqrt(2). Every ``*_std_*`` is
+one standard deviation of what is drawn anew whenever the sensor is switched on. What is not given is left out.
 """
 
 from typing import Annotated, Literal

@@ -76,6 +76,7 @@ def read(
     """The sensor at ``tick``, and whether [] its reading is new.
 
     The pressure is rho v |v| / 2 of the air speed v along x; a tube that is blown on from behind reads less than zero.
+    The air is incompressible: the share M^2 / 4 of the Mach number M is missing, 0.1 % at 20 m/s and 2 % at 100 m/s.
     """
 
     def sample(key: jax.Array) -> AirspeedState:

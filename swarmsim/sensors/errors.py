@@ -6,6 +6,7 @@ Cambridge UCAM-CL-TR-696, 2007, section 3.2, for MEMS parts): the drift is a fir
 usual model of a bias instability that keeps to itself.
 """
 
+import math
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -126,8 +127,14 @@ def apply(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def sample_ticks(rate_hz: float, period_s: float) -> int:
-    """Base periods between two samples: as near to the rate as whole periods come, at least one."""
-    return max(1, round(1.0 / (rate_hz * period_s)))
+    """Base periods between two samples: those whose rate is nearest to ``rate_hz``, at least one.
+
+    Rounding the number of periods would let a part of 100 Hz sample at 125 Hz in periods of 4 ms: 83 Hz is nearer.
+    """
+    wanted = 1.0 / (rate_hz * period_s)
+    fewer = max(1, math.floor(wanted))
+    too_fast, too_slow = wanted / fewer - 1.0, 1.0 - wanted / (fewer + 1)
+    return fewer if too_fast <= too_slow + 1e-9 else fewer + 1
 
 
 def sampled(

@@ -110,8 +110,8 @@ def suite_of(
 
     Args:
         carrier: whose ``sensors`` are looked up by name, or the sensors themselves, at most one of each kind.
-        period_s: base period, one call of `read` each. A sensor samples at the whole number of base periods that is
-            nearest to its rate, at least one.
+        period_s: base period, one call of `read` each. A sensor samples every whole number of base periods, the
+            one whose rate is nearest to its own.
         place: where the mission's origin lies; the defaults of `Place` without it.
         known: sensors by name that come before those of the catalogue, such as ``scenario.sensors``.
 

@@ -18,7 +18,7 @@ CHANGES = {
     "a negative noise": ("rm3100", "noise_ut: 0.015", "noise_ut: -1", "noise_ut: is too small"),
     "not a number": ("ms5611", "noise_pa: 1.2", "noise_pa: .nan", "not a finite number"),
     "a text": ("ms5611", "noise_pa: 1.2", "noise_pa: loud", "allowed: a number from 0"),
-    "a misspelt field": ("bmi088", "noise_ug_sqrt_hz: 175", "noise_ug_hz: 175", "did you mean 'noise_ug_sqrt_hz'"),
+    "a misspelt field": ("bmi088", "noise_ug_sqrt_hz: 121", "noise_ug_hz: 121", "did you mean 'noise_ug_sqrt_hz'"),
     "an unknown kind": ("bmi088", "kind: imu", "kind: imus", "did you mean 'imu'"),
     "no kind": ("bmi088", "kind: imu\n", "", "field is missing"),
     "an unknown fix": ("zed_f9p", "fix: 3d", "fix: dgps", "one of 3d, rtk_float, rtk_fixed"),
@@ -40,7 +40,7 @@ CHANGES = {
     "an empty source": ("tfmini", "dropout: estimate", 'dropout: " "', "the source is empty for: dropout"),
     "another name": ("tfmini", "name: tfmini", "name: lidar", "differs from the file's"),
     "outages that are a number": ("zed_f9p_rtk", "mean_duration_s: 10.0", "mean_duration_s: 0", "is too small"),
-    "a latency of a minute": ("zed_f9p", "latency_s: 0.1", "latency_s: 60", "is too large"),
+    "a latency of a minute": ("zed_f9p", "latency_s: 0.12", "latency_s: 60", "is too large"),
 }
 
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import welch
 
 from swarmsim.config.load import load_named
 from swarmsim.sensors.allan import (
@@ -174,15 +175,20 @@ def test_the_bias_instability_of_a_record_is_that_of_its_closed_form() -> None:
     assert 3600.0 * high / 0.664 == pytest.approx(instability, rel=0.1)  # the peak is as high as the flat part
 
 
-@pytest.mark.parametrize("name", ["icm_20948", "bmi088"])
-def test_the_noise_of_a_shipped_part_is_that_of_its_data_sheet(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "gyro_deg_s", "accel_ug"),
+    [("icm_20948", 0.015, 230.0), ("bmi088", 0.014, math.sqrt((2 * 160.0**2 + 190.0**2) / 3))],
+)
+def test_the_noise_of_a_shipped_part_is_that_of_its_data_sheet(name: str, gyro_deg_s: float, accel_ug: float) -> None:
+    """Densities as data sheets give them: the noise in a bandwidth B is that density times sqrt(B), one-sided."""
     spec = load_named("sensors", name)
     suites = jax.tree.map(lambda *x: np.stack(x), *[suite_of([spec], 1.0 / spec.rate_hz)] * 2)
     gyro, accel = at_rest(suites, 2, 40_000)
-    noise = densities(allan_deviation(gyro.reshape(len(gyro), -1), 1.0 / spec.rate_hz)).random_walk
-    assert np.degrees(noise).mean() == pytest.approx(spec.gyroscope.noise_deg_s_sqrt_hz, rel=0.03)
-    noise = densities(allan_deviation(accel.reshape(len(accel), -1), 1.0 / spec.rate_hz)).random_walk
-    assert noise.mean() / 9.80665e-6 == pytest.approx(spec.accelerometer.noise_ug_sqrt_hz, rel=0.03)
+    for record, unit, density in ((gyro, math.radians(1.0), gyro_deg_s), (accel, 9.80665e-6, accel_ug)):
+        spectrum = welch(record, spec.rate_hz, nperseg=1024, axis=0, return_onesided=True)[1][4:-1]
+        assert math.sqrt(spectrum.mean()) / unit == pytest.approx(density, rel=0.03)
+        noise = densities(allan_deviation(record.reshape(len(record), -1), 1.0 / spec.rate_hz)).random_walk
+        assert noise.mean() / unit == pytest.approx(density / math.sqrt(2.0), rel=0.03)
 
 
 def test_rounding_adds_its_variance() -> None:

@@ -58,7 +58,7 @@ def test_half_of_all_fixes_of_a_shipped_receiver_lie_within_its_cep(
     away = np.hypot(*np.asarray(place)[usual, :2].T)
     assert np.median(away) == pytest.approx(cep_m, rel=0.05)
     if velocity_m_s is not None:
-        assert np.median(np.linalg.norm(velocity, axis=-1)) == pytest.approx(velocity_m_s, rel=0.3)
+        assert np.median(np.linalg.norm(velocity, axis=-1)) == pytest.approx(velocity_m_s, rel=0.03)
 
 
 def test_the_errors_are_correlated_in_time_and_what_is_said_of_them_is_true() -> None:

@@ -102,10 +102,28 @@ def test_each_sensor_is_fresh_at_its_rate_and_holds_its_reading_between() -> Non
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "period_s", "ticks"), [(1125.0, 0.004, 1), (50.0, 0.004, 5), (8.0, 0.004, 31), (0.5, 0.02, 100)]
+    ("rate_hz", "period_s", "ticks"),
+    [
+        (1125.0, 0.004, 1),
+        (50.0, 0.004, 5),
+        (8.0, 0.004, 31),
+        (0.5, 0.02, 100),
+        (100.0, 0.004, 3),  # 83 Hz is nearer than 125 Hz
+        (70.0, 0.01, 2),  # and 50 Hz than 100 Hz
+        (75.0, 0.01, 1),  # 100 and 50 Hz are as near
+    ],
 )
 def test_rates_are_whole_periods(rate_hz: float, period_s: float, ticks: int) -> None:
     assert sample_ticks(rate_hz, period_s) == ticks
+
+
+@settings(max_examples=200, deadline=None)
+@given(rate_hz=st.floats(0.1, 10_000.0), period_s=st.floats(1e-4, 1.0))
+def test_no_number_of_periods_has_a_nearer_rate(rate_hz: float, period_s: float) -> None:
+    ticks = sample_ticks(rate_hz, period_s)
+    away = abs(1.0 / (ticks * period_s) - rate_hz)
+    for other in (max(1, ticks - 1), ticks + 1):
+        assert away <= abs(1.0 / (other * period_s) - rate_hz) * (1 + 1e-6) + 1e-6 * rate_hz
 
 
 def test_the_rangefinder_looks_along_the_body_and_loses_the_ground() -> None:
