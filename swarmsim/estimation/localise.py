@@ -254,16 +254,17 @@ def localise(
         measurements: windows with their counts by region of interest, detector model by detector model.
         spans: rows from, to, and the detector model of each part (`spans_of`; static).
         params: settings.
-        known: an earlier estimate's state, to go on from.
+        known: an earlier estimate's state, to go on from; zeros say nothing.
     """
     problem = problem_of(presumed, measurements, spans)
     points, nuclides = jnp.asarray(presumed.points_m), jnp.asarray(presumed.nuclides)
     state = no_sources(problem, params.search.sources_max, nuclides.shape[0])
     if known is not None:
         # the windows are others now
+        there = known.sources.present[:, None]
         state = replace(
             state,
-            sources=known.sources,
+            sources=replace(known.sources, place=jnp.where(there, known.sources.place, state.sources.place)),
             unknowns=replace(state.unknowns, level=known.unknowns.level, lengths=known.unknowns.lengths),
         )
     state = find_sources(problem, points, nuclides, params.search, state)

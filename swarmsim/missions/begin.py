@@ -22,7 +22,7 @@ from swarmsim.missions.acting import (
     views,
 )
 from swarmsim.missions.plan import Phase, Plan
-from swarmsim.missions.state import NO_PHASE, MissionState, PhaseState, Signals, Survey
+from swarmsim.missions.state import NO_PHASE, MissionState, PhaseState, Signals
 from swarmsim.missions.trail import trail_start
 from swarmsim.policies.path import Path
 from swarmsim.policies.protocol import Situation
@@ -48,7 +48,7 @@ def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionStat
         phase_of=tuple(jnp.full(group.size, NO_PHASE, jnp.int32) for group in world.groups),
         belief=None if plan.mapping is None else recursive_map.start(plan.mapping, plan.bin_cells),
         windows=windows,
-        survey=_no_survey(world, plan, windows, key),
+        survey=knowledge.nothing_learned(world, plan, windows, key),
         over_s=jnp.asarray(jnp.inf, jnp.float32),
         sensing=None
         if plan.sensors is None
@@ -61,14 +61,6 @@ def begin_mission(key: jax.Array, world: World, plan: Plan) -> tuple[MissionStat
     active = jnp.zeros(len(world.groups), bool)
     running = jnp.zeros(len(plan.phases), bool)
     return mission, Signals(begin=begin, running=running, active=active, over=jnp.array(False))
-
-
-def _no_survey(world: World, plan: Plan, windows: Any, key: jax.Array) -> Survey | None:
-    """Room for a survey, where a phase asks for the source."""
-    if not any(phase.target == "source" for phase in plan.phases):
-        return None
-    shape = jax.eval_shape(lambda: knowledge.survey(plan, *knowledge.gathered(world, plan, windows, key)))
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
 
 
 def _idle(world: World, plan: Plan, phase: Phase, mission: MissionState, seen: Any) -> PhaseState:
@@ -129,11 +121,12 @@ def _first_commands(
 def begin_phase(world: World, plan: Plan, mission: MissionState, number: int) -> MissionState:
     """The mission with phase ``number`` begun now, or its planner asked again if it has begun already.
 
+    One that goes to the source goes where the mission's survey has it.
     Its vehicles leave the phase that they were in. A vehicle whose part in the mission has ended stays out.
     """
     phase, state = plan.phases[number], mission.phases[number]
     now = now_s(world, mission.world)
-    mission, target, found = _target(world, plan, phase, mission)
+    target, found = _target(plan, phase, mission)
     path = state.path
     if phase.plans:
         situation = _situation(world, phase, mission, target, found)
@@ -168,15 +161,15 @@ def _situation(world: World, phase: Phase, mission: MissionState, target_m: jax.
     return Situation(position_m=position, target_m=target_m, found=found)
 
 
-def _target(world: World, plan: Plan, phase: Phase, mission: MissionState) -> tuple[MissionState, jax.Array, jax.Array]:
-    """The mission with what was learned for it, the place [2] that the phase goes to, and whether [] there is one."""
+def _target(plan: Plan, phase: Phase, mission: MissionState) -> tuple[jax.Array, jax.Array]:
+    """The place [2] that the phase goes to, and whether [] there is one."""
     if phase.target == "source":
-        learned = knowledge.survey(plan, *knowledge.gathered(world, plan, mission.windows, mission.world.key))
-        return replace(mission, survey=learned), learned.estimated.fits.position_m[0, :2], learned.found
+        assert mission.survey is not None
+        return mission.survey.estimated.fits.position_m[0, :2], mission.survey.found
     if phase.target == "hotspot":
         assert plan.mapping is not None
         assert mission.belief is not None
         chart = recursive_map.read(plan.mapping, mission.belief)
         hotspots = extract_hotspots(plan.mapping, chart)
-        return mission, hotspots.position_m[0], hotspots.valid[0]
-    return mission, phase.target_m, jnp.array(phase.target == "point")
+        return hotspots.position_m[0], hotspots.valid[0]
+    return phase.target_m, jnp.array(phase.target == "point")

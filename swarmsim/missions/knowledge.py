@@ -16,6 +16,7 @@ from swarmsim.estimation import (
     localise,
 )
 from swarmsim.estimation.forward import Span, spans_of
+from swarmsim.estimation.sources import State
 from swarmsim.estimation.windows import Windows, measured, merged
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey
@@ -76,8 +77,33 @@ def gathered(
     return concatenate(*parts), spans_of(groups)
 
 
-def survey(plan: Plan, measurements: Measurements, spans: tuple[Span, ...]) -> Survey:
-    """Interpolate the map, find hotspots, and estimate the sources.
+@pytree
+class Inquiry:
+    """What an estimate works on, and what it found."""
+
+    key: jax.Array  # data of the mission's
+    windows: tuple[Windows | None, ...]
+    survey: Survey  # what was known before, then what is known
+    afresh: jax.Array  # [] bool: forget what was known before
+
+
+def learn(world: World, plan: Plan, inquiry: Inquiry) -> Inquiry:
+    """The inquiry with the survey of all its counts, whose estimate goes on from the one before."""
+    known = jax.tree.map(lambda x: jnp.where(inquiry.afresh, jnp.zeros_like(x), x), inquiry.survey.estimated.state)
+    measurements, spans = gathered(world, plan, inquiry.windows, jax.random.wrap_key_data(inquiry.key))
+    return replace(inquiry, survey=survey(plan, measurements, spans, known))
+
+
+def nothing_learned(world: World, plan: Plan, windows: tuple[Windows | None, ...], key: jax.Array) -> Survey | None:
+    """A survey of no counts; None for a mission that does not estimate sources."""
+    if not plan.estimates:
+        return None
+    shape = jax.eval_shape(lambda: survey(plan, *gathered(world, plan, windows, key), None))
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+
+
+def survey(plan: Plan, measurements: Measurements, spans: tuple[Span, ...], known: State | None) -> Survey:
+    """Interpolate the map, find hotspots, and estimate the sources, from where an earlier estimate came to.
 
     The map joins detectors of several models by their nominal backgrounds: the exposure of each is multiplied by its
     background over that of the first model, as if all its counts grew with its size alike.
@@ -90,38 +116,34 @@ def survey(plan: Plan, measurements: Measurements, spans: tuple[Span, ...]) -> S
     scaled = replace(measurements, exposure_s=measurements.exposure_s * size[measurements.detector])
     chart = interpolate(plan.mapping, scaled)
     hotspots = extract_hotspots(plan.mapping, chart)
-    estimated = localise(plan.presumed, measurements, spans, plan.localisation)
+    estimated = localise(plan.presumed, measurements, spans, plan.localisation, known)
     return Survey(map=chart, hotspots=hotspots, estimated=estimated, found=estimated.fits.present[0])
 
 
-def conclude(
+def named(
     key: jax.Array,
     world: World,
     plan: Plan,
     known: Survey,
-    measurements: Measurements,
-    spans: tuple[Span, ...],
+    windows: tuple[Windows | None, ...],
     trail: Trail | None = None,
-) -> Conclusion:
-    """Identify the nuclide from the spectra near the first source, and estimate the sources from all counts.
+) -> tuple[Survey, Accumulated, Identification]:
+    """Identify the nuclide from the spectra near the first source, and let the estimate go on with it.
 
     ``world`` is asked for the spectra alone, and the ``trail`` of its carried sources: they are drawn here, at the
     places and times of the measurements.
     """
-    assert plan.localisation is not None
     assert plan.presumed is not None
+    measurements, _ = gathered(world, plan, windows, key)
+    spectrum = _spectrum(key, world, plan, known, measurements, trail)
+    identification = identify(plan.detectors[plan.spectrometer], spectrum.counts, spectrum.live_s)
     state = known.estimated.state
-    spectrum, identification = None, None
-    if plan.spectrometer >= 0:
-        spectrum = _spectrum(key, world, plan, known, measurements, trail)
-        identification = identify(plan.detectors[plan.spectrometer], spectrum.counts, spectrum.live_s)
-        inside = jnp.asarray(plan.presumed.nuclides)[jnp.maximum(identification.nuclide, 0)]
-        named = (identification.confidence >= plan.confidence_min) & (identification.nuclide >= 0) & inside
-        nuclides = state.sources.nuclide
-        first = jnp.where(named & state.sources.present[0], identification.nuclide, nuclides[0])
-        state = replace(state, sources=replace(state.sources, nuclide=nuclides.at[0].set(first)))
-    estimated = localise(plan.presumed, measurements, spans, plan.localisation, state)
-    return Conclusion(survey=known, spectrum=spectrum, identification=identification, estimated=estimated)
+    inside = jnp.asarray(plan.presumed.nuclides)[jnp.maximum(identification.nuclide, 0)]
+    sure = (identification.confidence >= plan.confidence_min) & (identification.nuclide >= 0) & inside
+    nuclides = state.sources.nuclide
+    first = jnp.where(sure & state.sources.present[0], identification.nuclide, nuclides[0])
+    state = replace(state, sources=replace(state.sources, nuclide=nuclides.at[0].set(first)))
+    return replace(known, estimated=replace(known.estimated, state=state)), spectrum, identification
 
 
 def _spectrum(

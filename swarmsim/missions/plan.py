@@ -140,3 +140,13 @@ class Plan:
     bin_cells: int = static()  # side of a bin of the team's belief, in cells of the map
     spectrometer: int = static()  # detector model whose spectra are identified; -1 for none
     trail: int = static(default=0)  # decision periods in which the places of carried sources are kept for the spectra
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the sources are estimated."""
+        return self.mapping is not None and self.localisation is not None
+
+    @property
+    def asks(self) -> bool:
+        """Whether a phase asks for the source."""
+        return any(phase.target == "source" for phase in self.phases)

@@ -58,7 +58,7 @@ class MissionState:
     phase_of: tuple[jax.Array, ...]  # for each group [U] int32: phase that each vehicle is in, or NO_PHASE
     belief: Binned | None
     windows: tuple[Windows | None, ...]  # for each group: what its detectors counted
-    survey: Survey | None  # of the last phase that asked for the source
+    survey: Survey | None  # for the last phase that asked for the source; None if sources are not estimated
     over_s: jax.Array  # [] when the mission ended; inf: it has not
     sensing: Sensing | None  # None if no policy senses
     trail: Trail | None = None  # of the vehicles that carry sources, where spectra are drawn: truth, not known to it

@@ -14,8 +14,9 @@ from swarmsim.missions.external import Measured, Seat, external_frame, joined, l
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.segment import decided
 from swarmsim.missions.state import MissionState, Signals
+from swarmsim.runtime.mission_run import MissionRun, Segment, with_clock, without_clock
 from swarmsim.runtime.progress import Progress, SilentProgress
-from swarmsim.runtime.simulation import MissionBatch, MissionRun, Segment, Simulation, with_clock, without_clock
+from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.runtime.uninterrupted import uninterrupted
 from swarmsim.vehicles.state import RigidState
 from swarmsim.world.build import grouped
@@ -62,10 +63,9 @@ class LiveMission:
     def prepare(self) -> None:
         """Load or compile all programs, and run each of them once: no setpoint then waits for a compiler."""
         self.start()
-        phases = range(len(self._simulation.plan.phases))
-        self._batch.prepare([self._run.beginning(n, self._mission, 0, np.zeros(1, bool)) for n in phases])
-        for number in phases:  # for no mission
-            self._mission = self._batch.run(**self._run.beginning(number, self._mission, 0, np.zeros(1, bool)))
+        self._run.prepare(self._mission)
+        for number in range(len(self._simulation.plan.phases)):  # for no mission
+            self._mission = self._run.begin(number, self._mission, 0, np.zeros(1, bool))
         self.start()
         body = self.body()
         for _ in range(self._timing.decision_ticks // self._timing.judge_ticks):
@@ -92,9 +92,7 @@ class LiveMission:
         begun = []
         for number in self._due:
             with uninterrupted():
-                self._mission = self._batch.run(
-                    **self._run.beginning(int(number), self._mission, self._tick, np.ones(1, bool))
-                )
+                self._mission = self._run.begin(int(number), self._mission, self._tick, np.ones(1, bool))
             begun.append(self._simulation.plan.phases[number].name)
         self._due = np.array([], int)
         return tuple(begun)
@@ -226,7 +224,7 @@ class LiveMission:
             plans=self._inputs[1],
             end=end,
             segments=tuple(self._segments),
-            conclusion=self._run.conclude(end, self._keys),
+            conclusion=self._run.conclude(end),
             clock=self._simulation.clock.copy(),
             draws=self._draws,
         )

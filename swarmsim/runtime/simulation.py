@@ -2,11 +2,9 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from swarmsim import randomness
@@ -16,37 +14,20 @@ from swarmsim.config.scenario import Scenario
 from swarmsim.config.site_checks import check_site
 from swarmsim.config.values import with_values
 from swarmsim.families.draw import Drawer, Draws, with_given
-from swarmsim.missions.begin import begin_mission, begin_phase
-from swarmsim.missions.knowledge import Conclusion, conclude, gathered, survey
+from swarmsim.missions.knowledge import Conclusion
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.plan_build import build_plan, listens
-from swarmsim.missions.segment import segment
-from swarmsim.missions.state import Log, MissionState, Signals
-from swarmsim.runtime.batch import Again, Batch, Spread, filled, layout_for
+from swarmsim.missions.state import MissionState
+from swarmsim.runtime.batch import Batch, Spread, filled, layout_for
 from swarmsim.runtime.clock import Clock
+from swarmsim.runtime.mission_run import MissionRun, Segment
 from swarmsim.runtime.progress import Progress, SilentProgress
 from swarmsim.scalars import Layout
 from swarmsim.site import SiteModel
 from swarmsim.world.build import build_world
 from swarmsim.world.model import World
-from swarmsim.world.state import Clock as WorldClock
-from swarmsim.world.state import WorldState, moving
+from swarmsim.world.state import WorldState
 from swarmsim.world.step import reset
-
-AT_ONCE = 8  # decision periods that one call runs: each call costs the host 2 ms
-
-
-@dataclass(frozen=True)
-class Segment:
-    """What some decision periods in a row left."""
-
-    log: Log  # arrays [B, periods or more, …] of the groups that ran, None for the others
-    periods: int  # how many were simulated; what follows is void
-
-    def of(self, mission: int, logged: Any) -> np.ndarray:
-        """One mission's rows [T, …] of an array of the log, all periods in one axis."""
-        rows = np.asarray(logged)[mission, : self.periods]
-        return rows.reshape(-1, *rows.shape[2:])
 
 
 @dataclass(frozen=True)
@@ -155,7 +136,7 @@ class Simulation:
             plans=plans,
             end=end,
             segments=tuple(segments),
-            conclusion=run.conclude(end, keys),
+            conclusion=run.conclude(end),
             clock=self.clock.copy(),
             draws=draws,
         )
@@ -230,166 +211,4 @@ def _built(scenario: Scenario, site_model: SiteModel) -> tuple[World, Plan]:
     return world, build_plan(scenario, site_model, world)
 
 
-class MissionRun:
-    """One rollout: the host's side of it."""
-
-    def __init__(self, batch: Batch, worlds: Spread, plans: Spread, plan: Plan, tell: Progress):
-        self._batch, self._plan, self._tell = batch, plan, tell
-        self._inputs = (worlds, plans)
-        self._estimates = plan.localisation is not None and plan.mapping is not None
-
-    def fly(self, keys: Any) -> tuple[MissionState, list[Segment]]:
-        """All missions to their end, a decision period at a time."""
-        batch, names = self._batch, [phase.name for phase in self._plan.phases]
-        mission, signals = self.reset(keys)
-        self._prepare(keys, mission)
-        world = self._first_world()
-        timing, tick = world.timing, 0
-        segments: list[Segment] = []
-        horizon = float(sum(float(np.max(phase.time_limit_s)) for phase in self._plan.phases))
-        told: tuple[str, ...] = ()
-        begin, active = np.asarray(signals.begin), np.asarray(signals.active)
-        while True:
-            for number in np.flatnonzero(begin.any(axis=0)):
-                self._tell.phase(f"plan {names[number]}", 0.0)
-                mission = batch.run(**self.beginning(int(number), mission, tick, begin[:, number]))
-                told = ()
-            running = self._running(mission) if begin.any() else np.asarray(active.any(axis=0))
-            mission, (log, ran), (signals, ticks), periods = batch.run(**self._advance(mission, tick, running))
-            tick = int(np.asarray(ticks)[0])
-            segments.append(_segment_of(log, np.asarray(ran)[0], int(np.asarray(periods)[0])))
-            begin, active = np.asarray(signals.begin), np.asarray(signals.active)
-            running_phases = np.flatnonzero(np.asarray(signals.running).any(axis=0))
-            under_way = tuple(names[number] for number in running_phases)
-            if under_way and under_way != told:
-                self._tell.phase(" + ".join(under_way), horizon)
-                told = under_way
-            seconds = tick * timing.control_period_s
-            if told:
-                self._tell.advance(seconds, tick, max(tick, int(horizon / timing.control_period_s)))
-            if bool(np.asarray(signals.over).all()):
-                return mission, segments
-
-    def reset(self, keys: Any) -> tuple[MissionState, Signals]:
-        """All missions at their beginning."""
-        self._tell.phase("compile", 0.0)
-        begun: tuple[MissionState, Signals] = self._batch.run("reset", _begin_mission, self._inputs, keys)
-        return begun
-
-    def beginning(self, number: int, mission: MissionState, tick: int, begin: np.ndarray) -> dict[str, Any]:
-        """The call that begins a phase in the missions ``begin`` [B]."""
-        return {
-            "name": f"begin {self._plan.phases[number].name}",
-            "function": partial(_begin_phase, number),
-            "inputs": self._inputs,
-            "carried": mission,
-            "common": (np.int32(tick),),
-            "only": self._batch.put(begin),
-            "donate": True,
-            "shared": True,
-        }
-
-    def _advance(self, mission: MissionState, tick: int, running: np.ndarray) -> dict[str, Any]:
-        """The call that runs a segment."""
-        common = (np.int32(tick), np.asarray(running, bool))
-        return {
-            "name": "run",
-            "function": _segment,
-            "inputs": self._inputs,
-            "carried": mission,
-            "common": common,
-            "donate": True,
-            "again": Again(AT_ONCE, _onward),
-        }
-
-    def _conclusion(self, mission: MissionState, keys: Any) -> dict[str, Any]:
-        """The call that concludes the missions."""
-        carried = (jax.random.key_data(keys), mission)
-        return {
-            "name": "conclude",
-            "function": _conclude,
-            "inputs": self._inputs,
-            "carried": carried,
-            "in_turn": True,
-            "shared": True,
-        }
-
-    def _prepare(self, keys: Any, mission: MissionState) -> None:
-        """Begin to load or compile all programs of the mission, in the order that they are needed."""
-        nobody, groups = np.zeros(self._batch.missions, bool), len(mission.world.groups)
-        beginnings = [self.beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
-        calls = [*beginnings[:1], self._advance(mission, 0, np.ones(groups, bool)), *beginnings[1:]]
-        calls += [self._conclusion(mission, keys)] if self._estimates else []
-        self._batch.prepare(calls)
-
-    def _first_world(self) -> World:
-        structure = self._inputs[0].structure
-        return jax.tree.unflatten(structure, [None] * structure.num_leaves)
-
-    def _running(self, mission: MissionState) -> np.ndarray:
-        """Groups [G] with a vehicle that is moved on in any mission."""
-        return np.array([bool(np.asarray(moving(g)).any()) for g in mission.world.groups])
-
-    def conclude(self, mission: MissionState, keys: Any) -> Conclusion | None:
-        """What the missions found in the end."""
-        if not self._estimates:
-            return None
-        self._tell.phase("estimate and identify", 0.0)
-        return self._batch.run(**self._conclusion(mission, keys))
-
-
-def with_clock(mission: MissionState, tick: jax.Array, running: jax.Array) -> MissionState:
-    world = mission.world
-    clock, key = WorldClock(tick=tick, running=running), jax.random.wrap_key_data(world.key)
-    return replace(mission, world=replace(world, clock=clock, key=key))
-
-
-def without_clock(mission: MissionState) -> MissionState:
-    """The mission without what all missions have in common, so that every leaf has the mission axis.
-
-    Its key goes as plain numbers: JAX calls a program that returns keys in Python, 1 ms each time.
-    """
-    world = mission.world
-    bare = replace(world, clock=None, key=jax.random.key_data(world.key))  # type: ignore[arg-type]
-    return replace(mission, world=bare)
-
-
-def _begin_mission(world: World, plan: Plan, key: jax.Array) -> tuple[MissionState, Signals]:
-    mission, signals = begin_mission(key, world, plan)
-    return without_clock(mission), signals
-
-
-def _begin_phase(number: int, world: World, plan: Plan, mission: MissionState, tick: jax.Array) -> MissionState:
-    running = jnp.ones(len(world.groups), bool)
-    return without_clock(begin_phase(world, plan, with_clock(mission, tick, running), number))
-
-
-def _segment(
-    world: World, plan: Plan, mission: MissionState, tick: jax.Array, running: jax.Array
-) -> tuple[MissionState, tuple[Log, jax.Array], tuple[Signals, jax.Array]]:
-    mission, log, signals = segment(world, plan, with_clock(mission, tick, running))
-    return without_clock(mission), (log, running), (signals, tick + world.timing.decision_ticks)
-
-
-def _onward(verdict: tuple[Signals, jax.Array], _: Any) -> tuple[jax.Array, Any]:
-    """Whether all missions go on without the host, and with which clock."""
-    signals, ticks = verdict
-    return ~jnp.any(signals.begin) & ~jnp.all(signals.over), (ticks[0], jnp.any(signals.active, axis=0))
-
-
-def _conclude(world: World, plan: Plan, carried: tuple[jax.Array, MissionState]) -> Conclusion:
-    key, mission = jax.random.wrap_key_data(carried[0]), carried[1]
-    measurements = gathered(world, plan, mission.windows, key)
-    known = survey(plan, *measurements) if mission.survey is None else mission.survey
-    return conclude(key, world, plan, known, *measurements, mission.trail)
-
-
-def _segment_of(log: Log, ran: np.ndarray, periods: int) -> Segment:
-    """The segment without the groups that rested throughout; ``ran`` [periods or more, G]."""
-    kept = [bool(np.any(group)) for group in ran[:periods].T]
-    tracks = tuple(t if k else None for t, k in zip(log.tracks, kept, strict=True))
-    samples = tuple(s if k else None for s, k in zip(log.samples, kept, strict=True))
-    return Segment(log=replace(log, tracks=tracks, samples=samples), periods=periods)  # type: ignore[arg-type]
-
-
-__all__ = ["MissionBatch", "MissionRun", "Segment", "Simulation"]
+__all__ = ["MissionBatch", "Simulation"]
