@@ -222,8 +222,8 @@ def test_that_the_others_go_on_after_a_takeover_is_told(live, monkeypatch):
 
     _, error, told = flown(live, link, during=operator)
     assert error is None
-    assert "the operator took over" in told[-2]
-    assert "the other vehicles go on" in told[-1]
+    for sentence in ("the operator took over", "the other vehicles go on"):
+        assert any(sentence in line for line in told[-2:]), told
 
 
 def test_a_takeover_while_it_holds_is_not_overruled(live):
