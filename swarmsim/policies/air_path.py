@@ -8,7 +8,15 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.config.vehicles import Multirotor
-from swarmsim.policies.path import Path, limit_speed, resample
+from swarmsim.policies.path import (
+    Path,
+    acceleration_along,
+    limit_in_bends,
+    limit_speed,
+    resample,
+    rounded,
+    rounded_above,
+)
 from swarmsim.pytree import on_host, pytree
 from swarmsim.site import Site, sample
 
@@ -57,7 +65,12 @@ def air_path(
 ) -> Path:
     """Path from ``start_m`` [3] up, over ``corners_m`` [W, 2] at a safe height, and down at ``home_m`` [2] to land."""
     flat, flat_length = resample(jnp.concatenate([start_m[None, :2], corners_m, home_m[None]]), points)
-    height = safe_height(profile, site, flat, flat_length / (points - 1))
+    spacing = flat_length / (points - 1)
+    flat = rounded(flat, spacing, CORNER_M)
+    height = safe_height(profile, site, flat, spacing)
+    # so far that, at the speed of the flight, a climb begins and ends with the acceleration that there is
+    ease = CLIMB_GRADIENT * jnp.square(profile.speed_m_s) / (2.0 * profile.acceleration_m_s2)
+    height = rounded_above(height, ease / jnp.maximum(spacing, 1e-6))
     survey = jnp.concatenate([flat, height[:, None]], axis=-1)
     ground = sample(site.terrain_m, site, home_m)
     rise = jnp.linspace(0.0, 1.0, VERTICAL_POINTS)[:, None]
@@ -68,11 +81,18 @@ def air_path(
     low = places[:, 2] < ground + TOUCHDOWN_HEIGHT_M
     down = jnp.where(low, profile.touchdown_speed_m_s, profile.descent_speed_m_s)
     cruise = jnp.where(vertical > 0.9, profile.climb_speed_m_s, jnp.where(vertical < -0.9, down, profile.speed_m_s))
+    cruise = limit_in_bends(places, cruise, profile.acceleration_m_s2)
     speed = limit_speed(places, cruise, profile.acceleration_m_s2, CORNER_M)
     # the landing must not stop above ground: the last points keep the touchdown speed
     landing = low & (jnp.arange(points) > points // 2)
     speed = jnp.where(landing, profile.touchdown_speed_m_s, speed)
-    return Path(points_m=places, speed_m_s=speed, spacing_m=length / (points - 1), length_m=length)
+    return Path(
+        points_m=places,
+        speed_m_s=speed,
+        spacing_m=length / (points - 1),
+        length_m=length,
+        acceleration_m_s2=acceleration_along(places, speed, profile.acceleration_m_s2),
+    )
 
 
 def safe_height(profile: FlightProfile, site: Site, xy: jax.Array, spacing: jax.Array) -> jax.Array:

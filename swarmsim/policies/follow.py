@@ -58,7 +58,7 @@ class FollowByAir:
         command = PositionCommand(
             position_m=here.position_m + view.push_m,
             velocity_m_s=pace * here.velocity_m_s,
-            acceleration_m_s2=jnp.zeros(3),
+            acceleration_m_s2=pace * pace * here.acceleration_m_s2,
             yaw_rad=task.yaw_rad,
             hold_position=jnp.ones(()),
         )

@@ -101,7 +101,7 @@ def test_a_users_policy_from_a_file_flies(climbing):
 
 def test_decision_periods_in_one_call_are_those_of_a_call_each(climbing, monkeypatch):
     together = climbing.rollout([0, 3, 5])
-    monkeypatch.setattr("swarmsim.runtime.simulation.AT_ONCE", 1)
+    monkeypatch.setattr("swarmsim.runtime.mission_run.AT_ONCE", 1)
     one_by_one = climbing.rollout([0, 3, 5])
     assert len(together.segments) < len(one_by_one.segments) == sum(s.periods for s in one_by_one.segments)
     assert sum(s.periods for s in together.segments) == len(one_by_one.segments)

@@ -36,7 +36,7 @@ def test_the_circle_is_flown_as_often_as_asked_from_opposite_sides(paths):
         last = np.argmax(np.diff(beside))  # the longest part of the path on the circle
         angle = np.unwrap(np.arctan2(*offset[beside[last] + 1 : beside[last + 1]].T[::-1]))
         assert np.cos(angle[0] - np.pi * number) > 0.99
-        assert angle[-1] - angle[0] == pytest.approx(2.0 * np.pi * TURNS, abs=0.15)
+        assert angle[-1] - angle[0] == pytest.approx(2.0 * np.pi * TURNS, abs=0.25)  # less its corners
         assert np.all(np.diff(angle) > -0.05)
 
 

@@ -30,7 +30,7 @@ def test_multirotors_visit_the_points_in_their_order_and_land_at_home():
         np.testing.assert_allclose(points[-1, :2], home, atol=1e-3)
         assert points[-1, 2] < 0.0
         near, when = distances(points, POINTS)
-        assert near.max() < 0.4
+        assert near.max() < 0.5 + 0.15  # corners are cut by half a metre; points of the path lie half a metre apart
         assert np.all(np.diff(when) > 0)
         np.testing.assert_allclose(points[when, 2], 10.0, atol=0.05)
 
@@ -43,7 +43,7 @@ def test_laps_repeat_the_points():
     ]
     once, thrice = (plan(planner.task(each), site, situation(HOMES[:1])) for each in made)
     lap = np.linalg.norm(np.diff([*POINTS, POINTS[0]], axis=0), axis=1).sum()
-    assert float((thrice.length_m - once.length_m)[0]) == pytest.approx(2.0 * lap, rel=0.01)
+    assert float((thrice.length_m - once.length_m)[0]) == pytest.approx(2.0 * lap, rel=0.05)  # corners are cut
 
 
 @pytest.fixture(scope="module")
