@@ -94,7 +94,10 @@ class Orbit(_Targeted, _Flown):
 
 
 class Waypoints(_Flown):
-    """Visit points (ENU, m) in their order, ``laps`` times; ``altitude_m`` above ground is for multirotors only."""
+    """Visit points (ENU, m) in their order, ``laps`` times; ``altitude_m`` above ground is for multirotors only.
+
+    Multirotors pass them within half a metre, in a curve.
+    """
 
     points: tuple[Vec2, ...] = Field(min_length=1, max_length=1000)
     speed_m_s: float = Field(ge=0.01, le=30)
