@@ -59,6 +59,7 @@ class Control:
         self._armed = False  # we armed it, or it took off for us
         self._last: Setpoint | None = None
         self._ended_s = 0.0  # when the autopilot was asked to end
+        self._asked_s: float | None = None  # when a mode was last asked for
 
     # What is seen
 
@@ -230,19 +231,23 @@ class Control:
         self._mode = None
         self.stream.halt()
         how = self.settings.watchdogs.then
-        end, asked_s, heard_s = time.monotonic() + self.settings.land_s, None, None
+        end, asks = time.monotonic() + self.settings.land_s, False
         while (t := self.link.telemetry()).armed and t.mode in ours:
-            now = time.monotonic()
-            if asked_s is None:
+            now, before = time.monotonic(), self._asked_s
+            if not asks:
                 self._stage(f"asking for {how} because of that")
-            if asked_s is None or (now - asked_s > ASK_AGAIN_S and t.heard_s != heard_s):  # it has said so since
+            # again only where it has said since that it does not: an operator may take over while nothing is heard
+            if before is None or (
+                t.heard_s is not None and t.heard_s > before and (not asks or now - before > ASK_AGAIN_S)
+            ):
+                self._asked_s = now
                 self.link.request(_MODES[how])
-                asked_s, heard_s = now, t.heard_s
+            asks = True
             if now > end:
                 self._stage(f"it has not told for {self.settings.land_s:g} s that it does: its own failsafe has to act")
                 return
             time.sleep(POLL_S)
-        if asked_s is not None:
+        if asks:
             self._stage(f"it is in mode {t.mode_name}{'' if t.armed else ', disarmed'}; nothing more is asked of it")
 
     # Inside
@@ -292,6 +297,7 @@ class Control:
             self._released(f"it is in mode {now.mode_name}, which was not ours: nothing more was asked of it")
             return
         try:
+            self._asked_s = time.monotonic()
             self.link.enter(mode, self.settings.answer_s)
             self._mode = mode
         except BaseException:  # it holds as we had asked, until somebody asks for something else
@@ -316,6 +322,7 @@ class Control:
             if self.link.telemetry().mode is Mode.FOLLOW:  # who should act on it may be stuck: it is asked to hold here
                 self._mode = Mode.HOLD
                 self.stream.halt()
+                self._asked_s = time.monotonic()
                 self.link.request(Mode.HOLD)
                 self._stuck = threading.Timer(self.settings.watchdogs.hold_s, self._on_stuck)
                 self._stuck.daemon = True
@@ -326,7 +333,7 @@ class Control:
         with self._lock:
             if self._stuck is None or self._mode is not Mode.HOLD or self.link.telemetry().mode is not Mode.HOLD:
                 return
-            self._mode = _MODES[self.settings.watchdogs.then]
+            self._mode, self._asked_s = _MODES[self.settings.watchdogs.then], time.monotonic()
             self.link.request(self._mode)
 
     def _awake(self) -> None:

@@ -141,6 +141,27 @@ def test_a_vehicle_that_is_silent_is_asked_once_and_given_up(link, monkeypatch):
     assert asked == [Mode.LAND]
 
 
+def test_a_landing_that_was_asked_of_a_silent_vehicle_is_not_asked_for_again_before_it_is_heard(link, monkeypatch):
+    """An operator may have taken over meanwhile."""
+    control = controlled(link, QUICK.model_copy(update={"land_s": 1.5}))
+    assert control.start(ABOVE_M, 0.0)
+    link.heard = False
+
+    def enter(mode, timeout_s):
+        link.asked.append(f"blind {mode.value}")
+        time.sleep(0.2)
+        raise LinkError("nothing is heard of it")
+
+    monkeypatch.setattr(link, "enter", enter)
+    control.alarm = Alarm(Action.END, "the link is lost")
+    with pytest.raises(LinkError):
+        control.watch()
+    threading.Timer(0.5, lambda: vars(link).update(mode=Mode.OTHER, heard=True)).start()
+    control.emergency()
+    assert link.asked[-1] == "blind land"
+    assert link.mode is Mode.OTHER
+
+
 @pytest.mark.parametrize("stops", [LinkError("it was refused"), KeyboardInterrupt()], ids=["refused", "stopped"])
 def test_a_vehicle_that_was_to_hold_for_a_while_is_not_left_in_the_air(link, monkeypatch, stops):
     control = controlled(link)

@@ -87,6 +87,58 @@ def test_an_operator_is_not_overruled(linked):
     assert len(peer.commands(SET_MODE)) == asked
 
 
+def entering(vehicle, mode, timeout_s=10.0):
+    """Ask for a mode beside; what came of it is in the list once the thread has ended."""
+    errors: list[LinkError] = []
+
+    def enter() -> None:
+        try:
+            vehicle.enter(mode, timeout_s)
+        except LinkError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    return thread, errors
+
+
+def test_an_operator_who_takes_over_in_a_gap_of_the_link_is_not_overruled(linked):
+    peer, vehicle = linked()
+    peer.obeys, peer.deaf = set(), {"HEARTBEAT"}
+    thread, errors = entering(vehicle, Mode.LAND)
+    assert peers.eventually(lambda: peer.commands(SET_MODE))
+    peer.custom_mode, peer.obeys = POSITION, {SET_MODE}  # from now on a repetition would be obeyed
+    time.sleep(2.5)
+    assert len(peer.commands(SET_MODE)) == 1
+    peer.deaf = set()
+    thread.join()
+    assert "mode became POSCTL" in str(errors[0])
+    assert peer.custom_mode == POSITION
+
+
+def test_a_mode_is_asked_for_again_once_a_heartbeat_tells_that_nothing_has_changed(linked):
+    peer, vehicle = linked()
+    peer.obeys, peer.deaf = set(), {"HEARTBEAT"}
+    thread, errors = entering(vehicle, Mode.LAND)
+    assert peers.eventually(lambda: peer.commands(SET_MODE))
+    peer.obeys = {SET_MODE}
+    time.sleep(1.0)
+    peer.deaf = set()
+    thread.join()
+    assert not errors
+    assert peer.custom_mode == peers.LAND
+    assert [m.confirmation for m in peer.commands(SET_MODE)] == [0, 1]
+
+
+def test_arming_and_take_off_are_not_repeated_into_silence(linked):
+    peer, vehicle = linked({"autopilot": ARDUPILOT})
+    peer.obeys, peer.deaf, peer.answers = set(), {"HEARTBEAT"}, {ARM: [], TAKEOFF: []}
+    for number, ask in ((ARM, lambda: vehicle.arm(2.0)), (TAKEOFF, lambda: vehicle.take_off(5.0, 2.0))):
+        with pytest.raises(LinkError, match="asked once"):
+            ask()
+        assert len(peer.commands(number)) == 1
+
+
 def test_a_lost_link_is_told_when_a_command_fails(linked):
     peer, vehicle = linked()
     peer.close()

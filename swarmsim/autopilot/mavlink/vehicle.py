@@ -21,7 +21,7 @@ from swarmsim.autopilot.mavlink.rates import Rates
 from swarmsim.autopilot.mavlink.wire import Message, read_key
 from swarmsim.autopilot.mavlink.words import Words
 
-_ASK_AGAIN_S = 1.0
+_ASK_AGAIN_S = 0.7  # less than the period of heartbeats: the next one tells whether to ask again
 _CUSTOM_MODE_ENABLED = 1
 _HARMLESS = {  # what is sent in a dry run: nothing of it moves the vehicle
     mavlink.MAVLINK_MSG_ID_PARAM_REQUEST_READ: None,
@@ -316,14 +316,15 @@ class MavlinkVehicle:
     ) -> None:
         """Send a command again and again until the vehicle's state shows it; nothing else is believed.
 
-        ``once`` stops sending when it was accepted: the state takes its time. Raises `LinkError` with the answers,
-        the words and the sensors that may say why not; at once where the mode becomes another one meanwhile, which
-        an operator or a failsafe chose: it must not be overruled by the next attempt.
+        It is repeated only on a heartbeat that came since the last attempt and still tells the mode from before: while
+        nothing is heard, an operator may have taken over. ``once`` stops sending when it was accepted: the state takes
+        its time. Raises `LinkError` with the answers, the words and the sensors that may say why not; at once where the
+        mode becomes another one meanwhile, which an operator or a failsafe chose: it must not be overruled.
         """
         if self.dry:
             self._words.note(f"dry run: {what} was not sent")
             return
-        begin = time.monotonic()
+        begin = sent_s = time.monotonic()
         number, parameters = int(command[0]), command[1:]
         tries = 0
         mode = self._heard.custom_mode
@@ -334,21 +335,26 @@ class MavlinkVehicle:
         def settled(heard: Heard) -> bool:
             return done(heard) or (mode is not None and heard.custom_mode != mode and not reached(heard))
 
+        def in_vain(heard: Heard) -> bool:
+            return settled(heard) or (heard.heard_s is not None and heard.heard_s >= sent_s + _ASK_AGAIN_S)
+
         while True:
             accepted = any(a.result == mavlink.MAV_RESULT_ACCEPTED for a in self._commands.answers(number, begin))
             if not (once and accepted):
                 self._commands.send(number, *parameters, confirmation=min(tries, 255))
                 tries += 1
-            end = begin + timeout_s
-            if self._wait(settled, min(end, time.monotonic() + _ASK_AGAIN_S)):
-                heard = self._heard
-                if reached(heard):
-                    return
+            sent_s = time.monotonic()
+            self._wait(in_vain, begin + timeout_s)
+            heard = self._heard
+            mode = heard.custom_mode if mode is None else mode
+            if done(heard):
+                return
+            if settled(heard):
                 raise LinkError(
                     f"the vehicle did not {what}: its mode became {heard.mode_name} meanwhile, by an operator or a "
                     "failsafe; nothing more was sent"
                 )
-            if time.monotonic() >= end:
+            if time.monotonic() >= begin + timeout_s:
                 raise LinkError(self._why_not(what, name, number, begin, tries))
 
     def _why_not(self, what: str, name: str, number: int, begin_s: float, tries: int) -> str:
@@ -356,7 +362,8 @@ class MavlinkVehicle:
         now = time.monotonic()
         answers = list(dict.fromkeys(a.name for a in self._commands.answers(number, begin_s)))
         lines = [
-            f"the vehicle did not {what}{f' ({name})' if name else ''} in {now - begin_s:.1f} s, asked {tries} times"
+            f"the vehicle did not {what}{f' ({name})' if name else ''} in {now - begin_s:.1f} s, asked "
+            + ("once" if tries == 1 else f"{tries} times")
         ]
         if heard.heard_s is None or now - heard.heard_s > checks.FRESH_S:
             lines.append("no heartbeat comes any more: the link is lost")
