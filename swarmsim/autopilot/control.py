@@ -16,7 +16,7 @@ from swarmsim.autopilot.convert import hold_at
 from swarmsim.autopilot.guard import Guard, RefusedError
 from swarmsim.autopilot.link import LinkError, Mode, Setpoint, Telemetry, Vector, VehicleLink
 from swarmsim.autopilot.stream import SetpointStream
-from swarmsim.autopilot.watch import Action, Alarm, Watch
+from swarmsim.autopilot.watch import Action, Alarm, Following, Watch
 from swarmsim.config.autopilot import Autopilot
 
 STREAMED_S = 1.5  # of setpoints before a vehicle that asks for them is told to follow (PX4 asks for 1 s)
@@ -25,7 +25,7 @@ RESTS_M_S, RESTS_S = 0.1, 3.0  # a rover on its way home has arrived when it has
 POLL_S = 0.05
 ASK_AGAIN_S = 1.0  # in an emergency, where the vehicle says that it still follows
 
-_MODES = {"land": Mode.LAND, "hold": Mode.HOLD, "return": Mode.RETURN}
+MODES = {"land": Mode.LAND, "hold": Mode.HOLD, "return": Mode.RETURN}
 
 
 class State(Enum):
@@ -52,12 +52,13 @@ class Control:
         self.stream = SetpointStream(
             link.send, guard, settings.stream_hz, dogs.stale_s, dogs.planning_s, self._on_stale, self._on_error
         )
-        self._stage, self._watch = stage, Watch(dogs)
+        self._stage, self._watch, self._following = stage, Watch(dogs), Following(dogs)
         self._stuck: threading.Timer | None = None  # acts for the thread of the flight if that does not
         self._lock = threading.Lock()
         self._mode: Mode | None = None  # the mode that we brought about; another one is somebody else's
         self._armed = False  # we armed it, or it took off for us
         self._last: Setpoint | None = None
+        self._by_hand = False  # a pilot gave it
         self._ended_s = 0.0  # when the autopilot was asked to end
         self._asked_s: float | None = None  # when a mode was last asked for
 
@@ -90,6 +91,8 @@ class Control:
                 where = None if t.position_m is None else self._guard.left(t.position_m)
                 if where is not None:
                     self._raise(Alarm(Action.END, f"the vehicle is {where}"))
+            watched = self._armed and self.state is State.FOLLOWS and not self._by_hand
+            self._raise(self._following.check(t, self._last if watched else None))
             if self.alarm is not None:
                 self._handle(self.alarm)
         return self.alarm is None
@@ -106,6 +109,7 @@ class Control:
             return False
         self.state = State.STARTS
         self._watch.forget()
+        self._following.forget()
         if link.streams_first:
             self.stream.resume()
             self.offer(waiting, keep=True)
@@ -155,11 +159,14 @@ class Control:
                 raise LinkError(f"it did not climb within {timeout_s:g} s: its height is {now}; {_told(self.link)}")
             time.sleep(POLL_S)
 
-    def offer(self, setpoint: Setpoint, *, keep: bool = False) -> None:
-        """Have a setpoint sent from now on; one that must not be sent ends the vehicle's part."""
+    def offer(self, setpoint: Setpoint, *, keep: bool = False, by_hand: bool = False) -> None:
+        """Have a setpoint sent from now on; one that must not be sent ends the vehicle's part.
+
+        One that a pilot gave ``by_hand`` is not watched for being followed: he sees it himself.
+        """
         try:
             self.stream.offer(setpoint, keep=keep)
-            self._last = setpoint
+            self._last, self._by_hand = setpoint, by_hand
         except RefusedError as error:
             self._raise(Alarm(Action.END, f"a setpoint was refused: {error}"))
 
@@ -177,7 +184,7 @@ class Control:
         """Leave setpoints for the autopilot's own land, hold or return; setpoints stop when it is in it."""
         how = how if self.flies or how == "return" else "hold"
         self._stage(how)
-        self._enter(_MODES[how])
+        self._enter(MODES[how])
         if self.state is not State.RELEASED:
             self.state = State.HOLDS if self.flies and how == "hold" else State.ENDS
             self._ended_s = self._slow_s = time.monotonic()
@@ -241,7 +248,7 @@ class Control:
                 t.heard_s is not None and t.heard_s > before and (not asks or now - before > ASK_AGAIN_S)
             ):
                 self._asked_s = now
-                self.link.request(_MODES[how])
+                self.link.request(MODES[how])
             asks = True
             if now > end:
                 self._stage(f"it has not told for {self.settings.land_s:g} s that it does: its own failsafe has to act")
@@ -268,7 +275,7 @@ class Control:
         if alarm.action is Action.RELEASE:
             self._release()
             return
-        then = _MODES[self.settings.watchdogs.then]
+        then = MODES[self.settings.watchdogs.then]
         begun = self._mode is then  # while this thread was stuck
         if alarm.action is Action.HOLD and not begun and not self._held():
             return
@@ -333,7 +340,7 @@ class Control:
         with self._lock:
             if self._stuck is None or self._mode is not Mode.HOLD or self.link.telemetry().mode is not Mode.HOLD:
                 return
-            self._mode, self._asked_s = _MODES[self.settings.watchdogs.then], time.monotonic()
+            self._mode, self._asked_s = MODES[self.settings.watchdogs.then], time.monotonic()
             self.link.request(self._mode)
 
     def _awake(self) -> None:
@@ -357,40 +364,9 @@ class Control:
                 self.alarm = alarm
 
 
-def refuse_under_way(link: VehicleLink) -> None:
-    """Raise `LinkError` if the vehicle is armed: somebody flies it, or a flight of ours was interrupted."""
-    if link.telemetry().armed:
-        raise LinkError(
-            "the vehicle is armed: somebody else flies it, or an earlier flight was interrupted. Have it disarmed (the "
-            "operator, or swarmsim fly MISSION --vehicle NAME --recover land), then start again"
-        )
-
-
-def recover(link: VehicleLink, how: str, settings: Autopilot, tell: Callable[[str], None]) -> None:
-    """Have a vehicle that is under way land or return (``how``), whoever left it there, until it is disarmed."""
-    drives = link.identity.vehicle == "rover"
-    mode = Mode.HOLD if drives and how == "land" else _MODES[how]
-    link.enter(mode, settings.answer_s)
-    kept = {mode, Mode.LAND} if mode is Mode.RETURN else {mode}
-    tell(f"it does: {mode.value}")
-    end, slow = time.monotonic() + settings.land_s, time.monotonic()
-    while (t := link.telemetry()).armed:
-        now = time.monotonic()
-        if t.mode not in kept and not t.failsafe:
-            raise LinkError(f"the operator took over with mode {t.mode_name}: nothing more is asked of it")
-        if t.velocity_m_s is None or float(np.hypot(*t.velocity_m_s[:2])) > RESTS_M_S:
-            slow = now
-        if drives and now - slow > RESTS_S:
-            link.disarm(settings.answer_s)
-        if now > end:
-            raise LinkError(f"it is still armed after {settings.land_s:g} s (autopilot.land_s)")
-        time.sleep(POLL_S)
-    tell("it stands, disarmed")
-
-
 def _told(link: VehicleLink) -> str:
     messages = link.messages()
     return "it says: " + " / ".join(messages[-5:]) if messages else "it has not said why"
 
 
-__all__ = ["Control", "State", "recover", "refuse_under_way"]
+__all__ = ["Control", "State"]

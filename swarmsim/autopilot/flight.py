@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from swarmsim.autopilot.control import Control, State, refuse_under_way
+from swarmsim.autopilot.control import Control, State
 from swarmsim.autopilot.convert import body_of, setpoint_of
 from swarmsim.autopilot.flown import FlownLog
 from swarmsim.autopilot.frames import Geodetic, enu_of_geodetic, yaw_of_quaternion
@@ -20,6 +20,7 @@ from swarmsim.autopilot.guard import Guard
 from swarmsim.autopilot.link import LinkError, Setpoint, Telemetry, Vector, VehicleLink
 from swarmsim.autopilot.manual.helm import Helm
 from swarmsim.autopilot.manual.sticks import Source
+from swarmsim.autopilot.under_way import refuse_under_way
 from swarmsim.config.autopilot import Autopilot
 from swarmsim.runtime.live import LiveMission, LiveStep
 from swarmsim.vehicles.state import RigidState

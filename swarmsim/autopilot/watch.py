@@ -5,8 +5,12 @@ import time
 from dataclasses import dataclass
 from enum import Enum
 
-from swarmsim.autopilot.link import Mode, Telemetry
+from swarmsim.autopilot.link import Mode, Setpoint, Telemetry, Vector
 from swarmsim.config.autopilot import Watchdogs
+
+UNSEEN_S = 1.0  # between two looks: what was seen before counts no more
+
+_WHY = "it does not follow; they may not reach it (uplink), or a fence or a limit of its own keeps it"
 
 
 class Action(Enum):
@@ -92,3 +96,41 @@ class Watch:
         if t.failsafe:
             return Alarm(Action.RELEASE, f"a failsafe of the autopilot acts, it is in mode {t.mode_name}")
         return Alarm(Action.RELEASE, f"the operator took over with mode {t.mode_name}", takeover=True)
+
+
+@dataclass
+class Following:
+    """Judges whether a vehicle follows the positions that are streamed.
+
+    An autopilot that gets no setpoint any more may stay in its mode and brake (ArduPilot), while all its telemetry
+    goes on.
+    """
+
+    limits: Watchdogs
+    _seen_s: float = -math.inf
+    _near_s: float = 0.0  # when it was last near enough
+    _stood: tuple[float, Vector] | None = None  # since when it has been around which place
+
+    def check(self, t: Telemetry, setpoint: Setpoint | None, now_s: float | None = None) -> Alarm | None:
+        """What is wrong now, with the ``setpoint`` that is streamed; nothing where that has no position."""
+        now, limits = time.monotonic() if now_s is None else now_s, self.limits
+        if setpoint is None or setpoint.position_m is None or t.position_m is None:
+            self.forget()
+            return None
+        if now - self._seen_s > UNSEEN_S:
+            self._near_s, self._stood = now, None
+        self._seen_s = now
+        apart = math.dist(setpoint.position_m, t.position_m)
+        if apart <= limits.away_m:
+            self._near_s = now
+        if apart <= limits.stuck_m or self._stood is None or math.dist(t.position_m, self._stood[1]) > limits.stuck_m:
+            self._stood = now, t.position_m
+        for does, since, most in (("was", self._near_s, limits.away_s), ("stood", self._stood[0], limits.stuck_s)):
+            if now - since > most:
+                for_s = f"for {now - since:.1f} s, {apart:.1f} m now"
+                return Alarm(Action.HOLD, f"the vehicle {does} away from its setpoints {for_s}: {_WHY}")
+        return None
+
+    def forget(self) -> None:
+        """What was seen counts no more."""
+        self._seen_s = -math.inf

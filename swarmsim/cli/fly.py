@@ -101,9 +101,9 @@ def _recovered(
     link: str, profile: str, system: int | None, key: Path | None, how: str, scenario: "Scenario", console: Console
 ) -> int:
     """Have a vehicle that is under way land or return, whoever left it there."""
-    from swarmsim.autopilot.control import recover
     from swarmsim.autopilot.link import LinkError
     from swarmsim.autopilot.opening import open_vehicle
+    from swarmsim.autopilot.under_way import recover
 
     try:
         vehicle = open_vehicle(link, profile=profile, system=system, key_file=key)
@@ -239,7 +239,7 @@ def _settings_for(
     vehicle: "VehicleLink", live: "LiveMission", scenario: "Scenario", name: str, screen: "StatusLine"
 ) -> "Autopilot":
     """How the vehicle on the link is flown. Raises where it is of another kind than the mission's, or under way."""
-    from swarmsim.autopilot.control import refuse_under_way
+    from swarmsim.autopilot.under_way import refuse_under_way
 
     known, flies = vehicle.identity, _flies(live)
     screen.tell(f"{known.autopilot} {known.vehicle} {known.version}, system {known.system}")

@@ -40,6 +40,13 @@ class Watchdogs(Model):
     does not take it back. The same happens to one that holds while the mission plans, after ``planning_s``. A battery
     below ``battery`` ends its part of the mission, and so does a measured position that jumps by more than ``jump_m``
     beyond what its speed explains: the state estimate was reset, and the setpoints are somewhere else now.
+
+    A vehicle that does not follow its positions holds as one whose setpoints are stale: one that is farther than
+    ``away_m`` from them for ``away_s``, or that has not left a place of ``stuck_m`` around it for ``stuck_s`` though
+    its setpoint lies farther off. The policies' references wait 1 to 2 m ahead of a vehicle that lags: a vehicle to
+    which no setpoint comes any more stays that near, and only standing there tells it. In flight it lags as much and
+    moves; corners and gusts add 2 to 3 m for a second or two, telemetry that is ``position_s`` old the way flown
+    meanwhile, at most 8 m by the limits.
     """
 
     stale_s: Duration = 0.5
@@ -49,6 +56,10 @@ class Watchdogs(Model):
     heartbeat_s: Duration = 3.0
     position_s: Duration = 1.0
     jump_m: Gap = 3.0
+    away_m: Gap = 10.0
+    away_s: Duration = 5.0
+    stuck_m: Gap = 1.5
+    stuck_s: Duration = 10.0
     battery: Fraction = 0.2
 
 

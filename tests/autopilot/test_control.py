@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmsim.autopilot.control import Control, State, recover
+from swarmsim.autopilot.control import Control, State
 from swarmsim.autopilot.guard import Guard
 from swarmsim.autopilot.link import LinkError, Mode, Setpoint, Telemetry
+from swarmsim.autopilot.under_way import recover
 from swarmsim.autopilot.watch import Action, Alarm, Watch
 from swarmsim.config.autopilot import Autopilot, SetpointLimits, Watchdogs
 from tests.autopilot.fake_link import FakeLink

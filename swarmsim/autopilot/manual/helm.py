@@ -146,7 +146,7 @@ class Helm:
                 self._pilot.begin(t)
             sticks = CENTRED if self._waits or self._handing else reading.sticks
             self.setpoint = self._pilot.setpoint(sticks, t, now_s)
-            self._control.offer(self.setpoint)
+            self._control.offer(self.setpoint, by_hand=True)
             here = place_of(t)
             if here is not None:
                 self._flown_m += math.dist(here, self._before) if self._before is not None else 0.0
