@@ -5,9 +5,9 @@ Two kinds of error are told apart, and neither stands for the other:
 - *Geometric*: the least horizontal distance of each place that was flown from a line, whenever it was flown: from the
   planned path of its phase (cross-track error), and from the simulated track. A vehicle that is merely late has none.
 - *Time-synchronised*: the horizontal distance between the flown and the simulated vehicle at the same time, after one
-  constant shift of time, the one with the least rms. It holds lags along the track, and whatever differs in take-off,
-  corners and speed after that one shift. A flight's clock and a mission's have no common zero, so that without a shift
-  the number would mean nothing.
+  constant shift of time, the one with the least rms over what was flown (`time_shift_s`). It holds lags along the
+  track, and whatever differs in take-off, corners and speed after that one shift. A flight's clock and a mission's have
+  no common zero, so that without a shift the number would mean nothing.
 
 "Simulated against firmware in the loop, same mission" is the time-synchronised rms over the whole common time, nothing
 left out. "On the lines" leaves out corners, take-off and landing: samples where the horizontal speed (simulated, or
@@ -26,12 +26,14 @@ Floats = NDArray[np.float64]
 ON_LINE_SHARE = 0.7  # of the greatest speed: slower parts are corners, take-off and landing
 STEP_S = 0.05  # of the times at which tracks are compared
 GAP_S = 1.0  # between two positions farther apart in time nothing is assumed
-OVERLAP = 0.8  # of the shorter track must be compared, or a shift is none
+CAP_M = 5.0  # what is farther apart fits no better or worse: several times what lags and estimates make
 CORNER_M = 0.5  # a path that bends by less is one leg
 LEG_M = 2.0  # shorter ones are corners
 LONG_S = 50_000.0
 _COARSE_S, _COARSE_MAX, _SHIFTS_MAX = 0.25, 2000, 8000  # first search for the shift: step, most samples, most shifts
 _SPEED_OVER_S = 1.0
+_MOVING_SHARE, _STANDING = 0.2, 0.1  # of the greatest speed: slower is standing, which counts so much in a shift
+_TIE_M = 0.5  # a shift over the whole search must make an rms better by as much as this
 _CHUNK = 256
 
 
@@ -270,34 +272,77 @@ def leg_ends_m(path_m: Floats) -> Floats:
 def time_shift_s(flown: Track, simulated: Track) -> float | None:
     """What to add to the simulated times so that the horizontal distance of both at the same time has the least rms.
 
-    None where no shift brings 0.8 of the shorter track over the other.
+    Every shift is judged by all that was flown: the simulated vehicle stands at its ends before and after its track, so
+    that a flight may begin before it on the ground and be broken off at any time. Distances count up to `CAP_M` where
+    more than half of the flight fits so, as what follows when it is broken off belongs to no simulated track; where
+    it stands it hardly counts. Of shifts that fit equally well, as on laps, both set out together with the one taken.
+    None where nothing was flown without gaps, or nothing simulated.
     """
     if len(flown.time_s) < 2 or len(simulated.time_s) < 2:
         return None
-    spans = [float(track.time_s[-1] - track.time_s[0]) for track in (flown, simulated)]
-    needed = OVERLAP * min(spans)
-
-    def rms(shift: float, times: Floats, there: Floats) -> float:
-        error = (flown.at(times + shift) - there)[:, :2]
-        known = np.isfinite(error).all(axis=1)
-        if known.sum() * (times[1] - times[0]) < needed:
-            return np.inf
-        return float(np.sqrt(np.mean(np.sum(error[known] ** 2, axis=1))))
-
-    step = max(_COARSE_S, sum(spans) / _SHIFTS_MAX)
-    times, there = _grid(simulated, min(max(_COARSE_S, spans[1] / _COARSE_MAX), spans[1] / 8.0))
-    first = float(flown.time_s[0] - simulated.time_s[-1])
-    shifts = first + step * np.arange(int(sum(spans) / step) + 2)
-    found = np.array([rms(float(shift), times, there) for shift in shifts])
-    if not np.isfinite(found).any():
+    low, high = flown.time_s[0] - simulated.time_s[-1], flown.time_s[-1] - simulated.time_s[0]
+    span = float(high - low)
+    fit = _Fit.of(flown, simulated, _COARSE_S, _COARSE_MAX)
+    if fit is None:
         return None
-    best = float(shifts[int(np.argmin(found))])
-    times, there = _grid(simulated, min(max(STEP_S, spans[1] / 20_000), spans[1] / 8.0))
-    near = minimize_scalar(
-        lambda shift: min(rms(float(shift), times, there), 1e9), bounds=(best - step, best + step), method="bounded",
-        options={"xatol": 1e-4},
-    )  # fmt: skip
-    return float(near.x) if near.fun <= rms(best, times, there) else best
+    step = max(_COARSE_S, span / _SHIFTS_MAX)
+    shifts = low + step * np.arange(int(span / step) + 2)
+    errors = np.array([fit.squares(float(shift)) for shift in shifts])
+    together = _sets_out_s(flown) - _sets_out_s(simulated)
+    for cap in (CAP_M, np.inf):
+        rough = np.minimum(errors, cap**2) @ fit.weights + _TIE_M**2 * np.abs(shifts - together) / span
+        best = int(np.argmin(rough))
+        if float((errors[best] < CAP_M**2) @ fit.weights) > 0.5:
+            break
+    fine = _Fit.of(flown, simulated, STEP_S, 20_000) or fit
+
+    def cost(shift: float) -> float:
+        return float(np.minimum(fine.squares(shift), cap**2) @ fine.weights)
+
+    first = float(shifts[best])
+    near = minimize_scalar(cost, bounds=(first - step, first + step), method="bounded", options={"xatol": 1e-4})
+    return float(near.x) if near.fun <= cost(first) else first
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Places [n, 2] of a flown track at times [n] with weights [n], to be compared with a simulated one."""
+
+    time_s: Floats
+    place_m: Floats
+    weights: Floats
+    simulated: Track
+
+    @classmethod
+    def of(cls, flown: Track, simulated: Track, step_s: float, most: int) -> "_Fit | None":
+        """At times ``step_s`` apart, or at ``most`` times; None where there is no flown place."""
+        span = float(flown.time_s[-1] - flown.time_s[0])
+        times, place = _grid(flown, min(max(step_s, span / most), span / 8.0))
+        known = np.isfinite(place).all(axis=1)
+        if not known.any():
+            return None
+        times, place = times[known], place[known, :2]
+        weights = np.where(_moves(flown, times), 1.0, _STANDING)
+        return cls(times, place, weights / np.sum(weights), simulated)
+
+    def squares(self, shift_s: float) -> Floats:
+        """Squares [n] of the distances from the simulated vehicle, which stands at its ends before and after."""
+        own, track = self.time_s - shift_s, self.simulated
+        there = [np.interp(own, track.time_s, column) for column in track.position_m.T[:2]]
+        error: Floats = (self.place_m[:, 0] - there[0]) ** 2 + (self.place_m[:, 1] - there[1]) ** 2
+        return error
+
+
+def _moves(track: Track, time_s: Floats) -> NDArray[np.bool_]:
+    """Whether [n] the vehicle moves over the ground; everywhere where it stands all along."""
+    speed = np.nan_to_num(track.speed_m_s(time_s))
+    moves = speed > _MOVING_SHARE * float(np.percentile(speed, 95.0))
+    return np.asarray(moves if moves.any() else ~moves)
+
+
+def _sets_out_s(track: Track) -> float:
+    times = _grid(track, max(_COARSE_S, float(track.time_s[-1] - track.time_s[0]) / _COARSE_MAX))[0]
+    return float(times[int(np.argmax(_moves(track, times)))])
 
 
 def _grid(track: Track, step_s: float) -> tuple[Floats, Floats]:

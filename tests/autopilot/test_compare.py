@@ -149,6 +149,68 @@ def test_a_flight_that_was_broken_off_is_compared():
     assert time_shift_s(flown, model) == pytest.approx(7.0, abs=0.02)
 
 
+LAWN = np.array([[0.0, 0, 5], [5, 30, 5], [45, 30, 5], [45, 18, 5], [5, 18, 5], [5, 6, 5], [45, 6, 5], [0, 0, 5]])
+
+
+def joined(parts, rate_hz=20.0):
+    """Tracks one after the other, standing still for the seconds in between, on one clock that begins at 0."""
+    times, places, now = [], [], 0.0
+    for part in parts:
+        if isinstance(part, float):
+            count = int(part * rate_hz)
+            times.append(now + np.arange(count) / rate_hz)
+            places.append(np.repeat(places[-1][-1:] if places else LAWN[:1], count, axis=0))
+            now += count / rate_hz
+        else:
+            times.append(now + part.time_s - part.time_s[0])
+            places.append(part.position_m)
+            now = float(times[-1][-1]) + 1.0 / rate_hz
+    return Track(np.concatenate(times), np.concatenate(places))
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    shift=st.floats(-300.0, 300.0),
+    stood=st.floats(0.0, 120.0),
+    share=st.floats(0.15, 1.0),
+    noise=st.floats(0.0, 0.5),
+    after=st.sampled_from(["nothing", "stands", "flies home", "flies home and stands"]),
+    seed=st.integers(0, 1000),
+)
+def test_the_shift_of_a_flight_that_was_broken_off_is_found(shift, stood, share, noise, after, seed):
+    """It may stand on the ground before, for longer than it flies, and fly home where no simulated vehicle does."""
+    model = along(LAWN)
+    count = int(share * len(model.time_s))
+    flight = Track(model.time_s[:count], model.position_m[:count])
+    home = along(np.array([flight.position_m[-1], [0.0, 0.0, 5.0]]), 6.0)
+    tail = {"nothing": [], "stands": [40.0], "flies home": [home], "flies home and stands": [home, 60.0]}[after]
+    whole = joined([stood, flight, *tail])
+    blur = noise * np.random.default_rng(seed).normal(size=whole.position_m.shape)
+    flown = moved(Track(whole.time_s, whole.position_m + blur), shift)
+    began = int(stood * 20.0) / 20.0
+    assert time_shift_s(flown, model) == pytest.approx(shift + began, abs=0.05 + 0.4 * noise)
+
+
+@settings(max_examples=20, deadline=None)
+@given(share=st.floats(0.1, 0.95), stood=st.floats(0.0, 60.0))
+def test_a_flight_broken_off_on_laps_is_that_of_the_first_ones(share, stood):
+    lap = np.concatenate([SQUARE, SQUARE[:1]])
+    model = along(np.concatenate([lap, lap[1:], lap[1:]]))
+    count = int(share * len(model.time_s))
+    flown = joined([stood, Track(model.time_s[:count], model.position_m[:count])])
+    assert time_shift_s(flown, model) == pytest.approx(int(stood * 20.0) / 20.0, abs=0.05)
+
+
+def test_a_flight_that_is_slower_all_along_has_the_shift_of_the_least_rms():
+    line = np.array([[0.0, 0, 3], [200, 0, 3]])
+    model, flown = along(line, 4.0), along(line, 3.0)
+    found = time_shift_s(flown, model)
+    error = {s: np.nanmean((flown.at(model.time_s + s) - model.position_m)[:, 0] ** 2) for s in (found - 3, found, 0.0)}
+    assert error[found] < error[0.0]
+    made = compare(flown, (), simulated(model)).report()["whole"]["synchronised"]
+    assert made["rms_m"] < 25.0
+
+
 def test_gaps_are_not_bridged():
     track = Track(np.array([0.0, 0.5, 3.0, 3.5]), np.zeros((4, 3)))
     assert np.isfinite(track.at([0.2, 3.2])).all()
