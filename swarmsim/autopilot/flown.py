@@ -13,8 +13,7 @@ import pyarrow.parquet as pq
 
 from swarmsim.autopilot.compare import nearest, on_lines
 from swarmsim.autopilot.link import Identity, Setpoint, Telemetry
-
-TRACK, REPORT = "flown.parquet", "flown.json"
+from swarmsim.results.names import FLIGHT, FLOWN
 
 _NOTHING = (np.nan, np.nan, np.nan)
 
@@ -112,5 +111,5 @@ def report(
 
 def write(folder: Path, log: FlownLog, summary: dict[str, Any]) -> None:
     """Write the track and the report into the run's folder."""
-    pq.write_table(log.table(), folder / TRACK)
-    (folder / REPORT).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    pq.write_table(log.table(), folder / FLOWN)
+    (folder / FLIGHT).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

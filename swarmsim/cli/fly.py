@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 EXIT_FLIGHT = 4  # the vehicle or the link did not do what the flight needed
 SWITCH_S = 0.0005  # Python's threads take turns this often: the stream must not wait for the mission
 ROWS = 30  # of the table of a dry run
-LOG = "flight"  # with the suffix of the link's log
 
 
 def fly_mission(
@@ -287,29 +286,36 @@ def _write(
     simulation: "Simulation", live: "LiveMission", flight: Any, vehicle: "VehicleLink", name: str, folder: Path,
     log: Path, force: bool, console: Console,
 ) -> None:  # fmt: skip
+    from swarmsim.atomic_folder import atomic_folder
     from swarmsim.autopilot import flown
     from swarmsim.autopilot.flown_overlay import write_overlay
     from swarmsim.autopilot.link import LinkError
     from swarmsim.cli.replay_log import print_comparison
     from swarmsim.results.extract import mission_record
+    from swarmsim.results.names import FLIGHT_LOG
+    from swarmsim.results.out_folder import check_out
     from swarmsim.results.run_directory import write_run
     from swarmsim.runtime.run import timings_of
 
     summary = flown.report(
         flight.log, flight.control.stream.gaps_s(), vehicle.identity, name, flight.control.takeover_s
     )
-    record = None
+    record, written = None, False
     try:
         with console.status("estimate and write"):
             batch = live.result()
             if batch.segments:
                 record = mission_record(simulation, batch, 0)
                 write_run(simulation, (record,), folder, timings_of(batch), force=force)
+                written = True
     finally:  # what was flown stays, whatever becomes of the estimate
+        if not written and folder.is_dir() and any(folder.iterdir()):  # nothing of an earlier run stays beside it
+            with atomic_folder(folder, partial(check_out, force=force)):
+                pass
         folder.mkdir(parents=True, exist_ok=True)
         flown.write(folder, flight.log, summary)
         if log.exists():  # a simulated vehicle has none
-            log.replace(folder / f"{LOG}{log.suffix}")
+            log.replace(folder / f"{FLIGHT_LOG}{log.suffix}")
     _print_summary(summary, console.print)
     if record is not None:
         try:

@@ -12,7 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from swarmsim.config.errors import InputError, file_errors_told
-from swarmsim.results.names import FIGURES, RECORDING, SCENARIO
+from swarmsim.results.names import FIGURES, FLIGHT, LOG, RECORDING, SCENARIO
+from swarmsim.results.out_folder import READ_LOG, check_folder
 
 if TYPE_CHECKING:
     from swarmsim.autopilot.compare import Comparison, Planned, Simulated
@@ -20,8 +21,7 @@ if TYPE_CHECKING:
     from swarmsim.autopilot.logs.flight_log import FlightLog
     from swarmsim.site.model import SiteModel
 
-REPORT, TRACK = "log.json", "track.parquet"
-_FLOWN = "flown.json"  # of a run's folder
+TRACK = "track.parquet"
 _MODES = 12  # lines of the table
 
 
@@ -45,7 +45,7 @@ def replay_log(
     console = Console()
     place = None if origin is None else _geodetic(origin)
     folder = out if out is not None else Path("runs") / f"log_{file.stem}"
-    check_folder(folder, force)
+    check_folder(folder, force, READ_LOG)
     source = _source(run, mission, vehicle)
     log = read_log(file, system)
     if place is not None and log.origin is None:
@@ -61,23 +61,6 @@ def replay_log(
     if found is not None and place is None:
         log, aligned = _aligned(log, found), "where the flight began"
     _write(file, folder, force, log, found, aligned, console)
-
-
-def check_folder(folder: Path, force: bool) -> None:
-    """Raise `InputError` unless a log's results can be written to ``folder``; with ``force`` others are replaced."""
-    if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        raise InputError.of("there is something else than a folder there", path="--out", given=str(folder))
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    hint = "choose another folder with --out"
-    if not (folder / REPORT).is_file():
-        raise InputError.of(
-            f"the folder holds something else than a log's results, and is not replaced (no {REPORT} in it)",
-            path="--out", given=str(folder), suggestion=hint,
-        )  # fmt: skip
-    if not force:
-        hint += ", or replace them with --force"
-        raise InputError.of("there are results already", path="--out", given=str(folder), suggestion=hint)
 
 
 def _geodetic(text: str) -> "Geodetic":
@@ -116,11 +99,11 @@ def _source(run: Path | None, mission: str | None, vehicle: str | None) -> tuple
 def _flown_vehicle(run: Path) -> str | None:
     """The vehicle that was flown outside in a run."""
     try:
-        return str(json.loads((run / _FLOWN).read_text(encoding="utf-8"))["vehicle"])
+        return str(json.loads((run / FLIGHT).read_text(encoding="utf-8"))["vehicle"])
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError.of("is damaged", file=run / _FLOWN, suggestion="name the vehicle with --vehicle") from error
+        raise InputError.of("is damaged", file=run / FLIGHT, suggestion="name the vehicle with --vehicle") from error
 
 
 def _mission(
@@ -181,9 +164,9 @@ def _write(
     summary = {"file": file.name} | report(log) | {"aligned": aligned}
     summary |= {"vehicle_of_mission": mission.vehicle, "comparison": made.report()} if mission else {}
     told = file_errors_told("the results cannot be written there", path="--out", given=str(folder))
-    with told, atomic_folder(folder, lambda target: check_folder(target, force)) as new:
+    with told, atomic_folder(folder, lambda target: check_folder(target, force, READ_LOG)) as new:
         pq.write_table(track_table(log), new / TRACK, compression="zstd")
-        (new / REPORT).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        (new / LOG).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         write_track_recording(overlay, site_model, new / RECORDING)
         write_figure(overlay, site_model, new / FIGURES)
     _print(log, made if mission else None, console)

@@ -22,7 +22,8 @@ from swarmsim.config.radiation import Detector as DetectorSpec
 from swarmsim.results import n42_elements as n42
 from swarmsim.results.counted import Counted
 from swarmsim.results.n42_elements import Element
-from swarmsim.results.out_folder import told_of
+from swarmsim.results.names import N42
+from swarmsim.results.out_folder import EXPORT, check_folder, told_of
 from swarmsim.results.places import places_of
 from swarmsim.results.record import Floats, Samples, Spectrum
 from swarmsim.results.spectra import SampleSpectra, sample_spectra
@@ -30,7 +31,6 @@ from swarmsim.runtime.simulation import Simulation
 from swarmsim.versions import package_versions
 from swarmsim.world.model import World
 
-SUFFIX = ".n42"
 SPECTRUM = "spectrum"
 START = datetime(2000, 1, 1, tzinfo=UTC)
 """When missions start where nothing else is said: simulated time has no date."""
@@ -72,9 +72,9 @@ def write_n42(
     chosen = _chosen(simulation, counted, vehicles)
     with told_of(out), atomic_folder(out, partial(check_export, force=force)) as folder:
         for name in chosen:
-            _write_vehicle(simulation, counted, name, folder / f"{name}{SUFFIX}", start, world)
+            _write_vehicle(simulation, counted, name, folder / f"{name}{N42}", start, world)
         if counted.spectrum is not None:
-            _write_spectrum(simulation, counted, counted.spectrum, folder / f"{SPECTRUM}{SUFFIX}", start)
+            _write_spectrum(simulation, counted, counted.spectrum, folder / f"{SPECTRUM}{N42}", start)
         written = sorted(path.name for path in folder.iterdir())
     return tuple(out / name for name in written)
 
@@ -93,18 +93,7 @@ def _chosen(simulation: Simulation, counted: Counted, vehicles: Sequence[str] | 
 
 def check_export(out: Path, force: bool) -> None:
     """Raise `InputError` where the folder ``out`` cannot be made or replaced."""
-    if not out.exists() and not out.is_symlink():
-        return
-    if not out.is_dir() or out.is_symlink() or any(path.suffix != SUFFIX for path in out.iterdir()):
-        raise InputError.of(
-            "there is something else than an export where it should go, and is not replaced",
-            path="--out",
-            given=str(out),
-            suggestion="choose another folder with --out",
-        )
-    if not force and any(out.iterdir()):
-        hint = "choose another folder with --out, or replace it with --force"
-        raise InputError.of("there is an export already", path="--out", given=str(out), suggestion=hint)
+    check_folder(out, force, EXPORT)
 
 
 def _heading(counted: Counted, start: datetime, remarks: Sequence[str]) -> list[Element]:

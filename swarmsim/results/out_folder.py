@@ -1,15 +1,73 @@
 """Where a run may be written, and where its results are kept when that fails."""
 
+import fnmatch
 import shutil
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from pathlib import Path
 
 from swarmsim.config.errors import InputError, file_errors_told
-from swarmsim.results.names import SCENARIO, SUMMARY
+from swarmsim.results import names
 
 SPACE_BYTES = 100_000_000  # several times the largest of the shipped missions' runs
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a folder holds that a command has written, and may replace."""
+
+    what: str  # with its article
+    files: tuple[str, ...] = ()  # which together tell it
+    nothing_but: tuple[str, ...] = ()  # patterns of names: a folder in which all match one is told by that
+
+    def fills(self, folder: Path) -> bool:
+        """Whether a folder is one of these."""
+        if self.files and all((folder / name).is_file() for name in self.files):
+            return True
+        return all(path.is_file() and self._matches(path.name) for path in folder.iterdir())
+
+    def _matches(self, name: str) -> bool:
+        return any(fnmatch.fnmatchcase(name, pattern) for pattern in self.nothing_but)
+
+
+# A flight that gave up before it had measured anything leaves no run, only what was flown.
+RUN = Content(
+    "a run",
+    (names.SUMMARY, names.SCENARIO),
+    (names.FLOWN, names.FLIGHT, *(names.FLIGHT_LOG + suffix for suffix in names.FLIGHT_LOGS)),
+)
+READ_LOG = Content("a log's results", (names.LOG,))
+EXPORT = Content("an export", nothing_but=(f"*{names.N42}",))
+
+
+def check_folder(out: Path, force: bool, content: Content) -> None:
+    """Raise `InputError` unless ``out`` can be made, or is empty, or with ``force`` holds what may be replaced.
+
+    The one rule for the folders of all results: what a folder holds that no command of ours has written stays.
+    """
+    if out.is_symlink() or (out.exists() and not out.is_dir()):
+        raise InputError.of(
+            "there is something else than a folder where the results should go", path="--out", given=str(out)
+        )
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    if not content.fills(out):
+        lacks = f" (no {' and '.join(content.files)} in it)" if content.files else ""
+        raise InputError.of(
+            f"the folder holds something else than {content.what}, and is not replaced{lacks}",
+            path="--out",
+            given=str(out),
+            suggestion="choose another folder with --out",
+        )
+    if not force:
+        raise InputError.of(
+            f"there are results already, {content.what}",
+            path="--out",
+            given=str(out),
+            suggestion="choose another folder with --out, or replace them with --force",
+        )
 
 
 def check_out(out: Path, force: bool) -> None:
@@ -67,21 +125,7 @@ def told_of(out: Path) -> AbstractContextManager[None]:
 
 
 def _check(out: Path, force: bool) -> None:
-    if out.is_symlink() or (out.exists() and not out.is_dir()):
-        raise InputError.of(
-            "there is something else than a folder where the results should go", path="--out", given=str(out)
-        )
-    if out.is_dir() and any(out.iterdir()):
-        if not ((out / SUMMARY).is_file() and (out / SCENARIO).is_file()):
-            raise InputError.of(
-                f"the folder holds something else than a run, and is not replaced (no {SUMMARY} and {SCENARIO} in it)",
-                path="--out",
-                given=str(out),
-                suggestion="choose another folder with --out",
-            )
-        if not force:
-            hint = "choose another folder with --out, or replace them with --force"
-            raise InputError.of("there are results already", path="--out", given=str(out), suggestion=hint)
+    check_folder(out, force, RUN)
     parent = next(p for p in out.absolute().parents if p.exists())
     if not parent.is_dir():
         raise InputError.of("the results cannot be written there", path="--out", given=str(out))

@@ -12,14 +12,17 @@ from unittest.mock import Mock
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from rich.console import Console
 
 from swarmsim.autopilot.flown import FlownLog
+from swarmsim.autopilot.link import Identity, Setpoint, Telemetry
 from swarmsim.autopilot.standin.kinematic import KinematicBody
 from swarmsim.autopilot.standin.settings import load_settings
 from swarmsim.autopilot.standin.sockets import open_link
 from swarmsim.autopilot.standin.vehicle import Standin
 from swarmsim.cli.entry import main
-from swarmsim.cli.fly import EXIT_FLIGHT, _free, _outcome
+from swarmsim.cli.fly import EXIT_FLIGHT, _free, _outcome, _write
+from swarmsim.results.out_folder import check_out
 from tests.autopilot.ports import free_port
 
 BLOCK = """
@@ -97,6 +100,25 @@ def test_a_vehicle_flies_its_part_of_the_mission(autopilot, vehicle, tmp_path, c
     for name in ("simulated.parquet", "planned.parquet", "mission.rrd", "figures/flown.png"):
         assert (tmp_path / "out" / name).is_file()
     capsys.readouterr()
+
+
+def test_a_flight_without_an_estimate_leaves_nothing_of_an_earlier_run_beside_its_own(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for name in ("summary.json", "scenario.yaml", "flown.json"):
+        (folder / name).touch()
+    flight_log = FlownLog()
+    here = Telemetry(position_m=(0.0, 0.0, 2.0), velocity_m_s=(0.0, 0.0, 0.0))
+    flight_log.row(0.0, Setpoint(position_m=(0.0, 0.0, 2.0)), here, lambda: None)
+    control = SimpleNamespace(stream=SimpleNamespace(gaps_s=lambda: np.zeros(0)), takeover_s=None)
+    flight = SimpleNamespace(log=flight_log, control=control)
+    live = SimpleNamespace(result=lambda: SimpleNamespace(segments=()))
+    vehicle = SimpleNamespace(identity=Identity("px4", "copter", 1, 1))
+    log = tmp_path / "out.tlog"
+    log.touch()
+    _write(None, live, flight, vehicle, "uav", folder, log, True, Console(quiet=True))
+    assert {path.name for path in folder.iterdir()} == {"flown.json", "flown.parquet", "flight.tlog"}
+    check_out(folder, force=True)
 
 
 def in_flight(standin, then):

@@ -321,7 +321,7 @@ def test_wrong_input_ends_with_a_sentence(
 def test_an_export_is_replaced_only_if_asked(simulation: swarmsim.Simulation, record, tmp_path: Path) -> None:
     paths = write_n42(simulation, record, tmp_path / "n42", vehicles=["tube"])
     assert [path.name for path in paths] == ["spectrum.n42", "tube.n42"]
-    with pytest.raises(InputError, match=r"(?s)export already.*--force"):
+    with pytest.raises(InputError, match=r"(?s)already, an export.*--force"):
         write_n42(simulation, record, tmp_path / "n42")
     write_n42(simulation, dataclasses.replace(record, spectrum=None), tmp_path / "n42", vehicles=["tube"], force=True)
     assert [path.name for path in (tmp_path / "n42").iterdir()] == ["tube.n42"]

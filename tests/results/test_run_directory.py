@@ -14,7 +14,7 @@ import pytest
 
 from swarmsim.config.errors import InputError
 from swarmsim.results import run_directory
-from swarmsim.results.out_folder import check_out
+from swarmsim.results.out_folder import EXPORT, READ_LOG, RUN, check_folder, check_out
 from swarmsim.results.record import MissionRecord
 from swarmsim.results.run_directory import Built, write_run
 from swarmsim.results.summary import Timings, batch_row
@@ -281,6 +281,39 @@ def test_a_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
         check_out(tmp_path / "link", force=True)
     with pytest.raises(InputError, match="cannot be written"):
         check_out(tmp_path / "thesis.tex" / "run", force=False)
+
+
+@pytest.mark.parametrize("left", [("flown.json", "flown.parquet", "flight.tlog"), ("flight.log",), ("flown.parquet",)])
+def test_what_a_flight_left_that_gave_up_early_may_be_replaced(tmp_path: Path, left: tuple[str, ...]) -> None:
+    for name in left:
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=r"(?s)results already.*--force"):
+        check_out(tmp_path, force=False)
+    check_out(tmp_path, force=True)
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(InputError, match="something else than a run"):
+        check_out(tmp_path, force=True)
+    (tmp_path / "thesis.tex").unlink()
+    (tmp_path / "flown").mkdir()
+    with pytest.raises(InputError, match="something else than a run"):
+        check_out(tmp_path, force=True)
+
+
+def test_each_kind_of_results_replaces_its_own_alone(tmp_path: Path) -> None:
+    made = {RUN: ("summary.json", "scenario.yaml"), READ_LOG: ("log.json", "track.parquet"), EXPORT: ("uav1.n42",)}
+    for kind, files in made.items():
+        folder = tmp_path / files[0]
+        folder.mkdir()
+        for file in files:
+            (folder / file).touch()
+        for other in made:
+            if other is kind:
+                check_folder(folder, True, other)
+                with pytest.raises(InputError, match="already"):
+                    check_folder(folder, False, other)
+            else:
+                with pytest.raises(InputError, match=f"something else than {other.what}"):
+                    check_folder(folder, True, other)
 
 
 def test_a_place_where_no_file_can_be_made_is_told_before_the_flight() -> None:
