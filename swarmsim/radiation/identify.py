@@ -118,7 +118,7 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
     chance = jax.nn.softmax(jnp.concatenate([score.ravel(), jnp.stack([none, unknown])]))
     added, none_chance, unknown_chance = chance[:-2].reshape(score.shape), chance[-2], chance[-1]
     of_base = jnp.sum(added, axis=1)
-    present = of_base @ stages.base + jnp.sum(added, axis=0)
+    present = _present(added, stages.base)
     main = jnp.argmax(of_base @ stages.share[:, 0] + jnp.sum(added * stages.share[:, 1], axis=0))
     nothing = jnp.where(unknown_chance > none_chance, UNKNOWN, NONE)
     other = jnp.maximum(none_chance, unknown_chance)
@@ -146,6 +146,15 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
         stranger=strangers.nuclide,
         alike=strangers.share * jnp.exp(known - unknown),
     )
+
+
+def _present(added: jax.Array, base: jax.Array) -> jax.Array:
+    """Probability [N] that each nuclide is present, of the chances [stages, N] of each that is added to a base.
+
+    ``base`` [stages, N] is 1 for the nuclides of each base. Chances that sum to 1 exceed it by single precision's
+    rounding when they are summed anew: that is cut off, as a probability of 1.0000001 is none.
+    """
+    return jnp.minimum(jnp.sum(added, axis=1) @ base + jnp.sum(added, axis=0), 1.0)
 
 
 def _strangers(detector: Detector, table: Tables, data: Data) -> _Strangers:

@@ -11,7 +11,7 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.load import load_named
 from swarmsim.radiation import Detector, Identification, Library, build_detector, identify, spectrum_rate
 from swarmsim.radiation.goodness import p_value
-from swarmsim.radiation.identify import NONE, UNKNOWN
+from swarmsim.radiation.identify import NONE, UNKNOWN, _present
 from swarmsim.radiation.laplace import COLUMNS, NATURAL, NATURAL_STD, Data, Hypothesis, laplace, swept
 from swarmsim.radiation.lines import GAINS, ORDERS, identification_bins, orders
 from swarmsim.radiation.response import build_response
@@ -23,6 +23,20 @@ LIVE_S = 60.0
 Detectors = dict[tuple[str, str], Detector]
 BATCH = 30
 _run = jax.jit(jax.vmap(identify, in_axes=(None, 0, None)))
+
+
+def test_certainty_is_no_more_than_one() -> None:
+    """All chances are of hypotheses with one nuclide: they sum to 1 but for the rounding of single precision."""
+    rng, nuclides, stages = np.random.default_rng(0), 12, 4
+    base = np.zeros((stages, nuclides), np.float32)
+    base[1:, 0] = 1.0
+    for _ in range(100):
+        score = rng.normal(size=(stages, nuclides))
+        score[0, 1:] = score[1:, 0] = -np.inf
+        chance = jax.nn.softmax(jnp.asarray(score.ravel(), jnp.float32)).reshape(stages, nuclides)
+        present = np.asarray(_present(chance, jnp.asarray(base)))
+        assert 1.0 - 1e-5 < present[0] <= 1.0
+        assert present[1:].sum() + float(chance[0, 0]) == pytest.approx(1.0, abs=1e-5)
 
 
 def spectrum(detector: Detector, nuclide: str, cps: float, **metres: float) -> jax.Array:
