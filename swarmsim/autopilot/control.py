@@ -8,13 +8,14 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
-from enum import Enum
 
 import numpy as np
 
 from swarmsim.autopilot.convert import hold_at
 from swarmsim.autopilot.guard import Guard, RefusedError
 from swarmsim.autopilot.link import LinkError, Mode, Setpoint, Telemetry, Vector, VehicleLink
+from swarmsim.autopilot.pulse import stopped
+from swarmsim.autopilot.state import State
 from swarmsim.autopilot.stream import SetpointStream
 from swarmsim.autopilot.watch import Action, Alarm, Following, Watch
 from swarmsim.config.autopilot import Autopilot
@@ -28,17 +29,6 @@ ASK_AGAIN_S = 1.0  # in an emergency, where the vehicle says that it still follo
 MODES = {"land": Mode.LAND, "hold": Mode.HOLD, "return": Mode.RETURN}
 
 
-class State(Enum):
-    """Who moves the vehicle."""
-
-    STANDS = "stands"  # nobody: it is disarmed, or has not been armed yet
-    STARTS = "starts"  # it is being armed and takes off
-    FOLLOWS = "follows"  # our setpoints
-    ENDS = "ends"  # the autopilot, which lands or returns because we asked for it
-    HOLDS = "holds"  # the autopilot, which holds in the air because we asked for it
-    RELEASED = "released"  # somebody else, for good
-
-
 class Control:
     """What we may do to one vehicle, and what we do when something is wrong."""
 
@@ -50,15 +40,24 @@ class Control:
         self.takeover_s: tuple[float, float] | None = None  # when an operator's was seen, and when the stream halted
         dogs = settings.watchdogs
         self.stream = SetpointStream(
-            link.send, guard, settings.stream_hz, dogs.stale_s, dogs.planning_s, self._on_stale, self._on_error
+            link.send,
+            guard,
+            settings.stream_hz,
+            dogs.stale_s,
+            dogs.planning_s,
+            self._on_stale,
+            lambda error: self.failed(f"a setpoint could not be sent: {error}"),
         )
         self._stage, self._watch, self._following = stage, Watch(dogs), Following(dogs)
         self._stuck: threading.Timer | None = None  # acts for the thread of the flight if that does not
+        self._acts = False  # that thread has taken notice of what is wrong
         self._lock = threading.Lock()
         self._mode: Mode | None = None  # the mode that we brought about; another one is somebody else's
         self._armed = False  # we armed it, or it took off for us
         self._last: Setpoint | None = None
         self._by_hand = False  # a pilot gave it
+        self._pauses = 0  # of this program, that were seen
+        self._taken: Alarm | None = None  # it is somebody else's, whatever was wrong before
         self._ended_s = 0.0  # when the autopilot was asked to end
         self._asked_s: float | None = None  # when a mode was last asked for
 
@@ -72,21 +71,22 @@ class Control:
         changed = changed or self._watch.mode_changed(t)
         if changed is not None:
             seen = time.monotonic()
-            self._mode = None
+            self._mode, self._taken = None, changed
             self.stream.halt()
-            self._halted(changed, seen)
-
-    def _halted(self, alarm: Alarm, seen_s: float) -> None:
-        if alarm.takeover:
-            self.takeover_s = seen_s, time.monotonic()
-        self._raise(alarm)
+            if changed.takeover:
+                self.takeover_s = seen, time.monotonic()
+            self._raise(changed)
 
     def watch(self) -> bool:
         """Look for what is wrong, and act on it; whether the vehicle is still ours."""
         self.stream.renew()
         t = self.link.telemetry()
+        pauses, paused_s = self.stream.pulse.pauses()
+        paused, self._pauses = pauses > self._pauses, pauses
         if self.state in (State.STARTS, State.FOLLOWS):
-            if self._armed:
+            if self._armed and paused:
+                self._raise(Alarm(Action.HOLD, stopped(paused_s)))
+            elif self._armed:
                 self._raise(self._watch.check(t))
                 where = None if t.position_m is None else self._guard.left(t.position_m)
                 if where is not None:
@@ -108,6 +108,7 @@ class Control:
         if not self._may_start(waiting):
             return False
         self.state = State.STARTS
+        self._pauses, _ = self.stream.pulse.pauses()
         self._watch.forget()
         self._following.forget()
         if link.streams_first:
@@ -228,6 +229,7 @@ class Control:
 
     def emergency(self) -> None:
         """Something failed: in the air, ask for what the settings say until it does that, or somebody else flies it."""
+        self._settle()
         ours = {Mode.FOLLOW}
         if self._mode is Mode.HOLD and self.state in (State.STARTS, State.FOLLOWS):
             ours.add(Mode.HOLD)  # it was to hold for a while only
@@ -295,11 +297,15 @@ class Control:
 
     def _enter(self, mode: Mode) -> None:
         """Change the mode, unless the one that it is in is neither of ours: that is a takeover."""
+        self._settle()
         now, before = self.link.telemetry(), self._mode
         ours = {Mode.FOLLOW, Mode.TAKEOFF, before, mode}
         self._mode = None  # the change that comes is ours
         if self.state is State.FOLLOWS and self.alarm is None:
             self.hold()  # until the mode has changed
+        if self._taken is not None:
+            self._released(self._taken.reason)
+            return
         if now.mode not in ours:
             self._released(f"it is in mode {now.mode_name}, which was not ours: nothing more was asked of it")
             return
@@ -323,20 +329,38 @@ class Control:
         self._mode, self.state = None, State.RELEASED
 
     def _on_stale(self, age_s: float) -> None:
-        if self._mode is Mode.FOLLOW:
-            reason = f"the mission gave no setpoint for {age_s:.1f} s: this computer is too slow"
-            self._raise(Alarm(Action.HOLD, reason))
-            if self.link.telemetry().mode is Mode.FOLLOW:  # who should act on it may be stuck: it is asked to hold here
-                self._mode = Mode.HOLD
-                self.stream.halt()
-                self._asked_s = time.monotonic()
-                self.link.request(Mode.HOLD)
-                self._stuck = threading.Timer(self.settings.watchdogs.hold_s, self._on_stuck)
-                self._stuck.daemon = True
-                self._stuck.start()
+        if self._mode is not Mode.FOLLOW:
+            return
+        if self.stream.pulse.just_woke():
+            self._raise(Alarm(Action.HOLD, stopped(age_s)))
+            self.stream.halt()
+            threading.Thread(target=self._hold_here, name="awake", daemon=True).start()  # the stream's must run
+        else:
+            self._raise(
+                Alarm(Action.HOLD, f"the mission gave no setpoint for {age_s:.1f} s: this computer is too slow")
+            )
+            self._hold_here()
+
+    def _hold_here(self) -> None:
+        """Ask for a hold, unless the thread of the flight acts on the alarm: it may be stuck."""
+        self._settle()
+        stuck = threading.Timer(self.settings.watchdogs.hold_s, self._on_stuck)
+        stuck.daemon = True
+        with self._lock:
+            if self._acts or self._mode is not Mode.FOLLOW or self.link.telemetry().mode is not Mode.FOLLOW:
+                return
+            self._mode, self._asked_s, self._stuck = Mode.HOLD, time.monotonic(), stuck
+        self.stream.halt()
+        self.link.request(Mode.HOLD)
+        stuck.start()
+
+    def _settle(self) -> None:
+        """After a pause of this program look again: an operator may have taken over meanwhile."""
+        self.stream.pulse.settle(lambda: self.link.telemetry().heard_s, self.settings.watchdogs.heartbeat_s)
 
     def _on_stuck(self) -> None:
         """The thread of the flight has not acted on an alarm: what comes after the hold is asked for here."""
+        self._settle()
         with self._lock:
             if self._stuck is None or self._mode is not Mode.HOLD or self.link.telemetry().mode is not Mode.HOLD:
                 return
@@ -346,12 +370,10 @@ class Control:
     def _awake(self) -> None:
         """The thread of the flight acts."""
         with self._lock:
+            self._acts = True
             if self._stuck is not None:
                 self._stuck.cancel()
                 self._stuck = None
-
-    def _on_error(self, error: Exception) -> None:
-        self.failed(f"a setpoint could not be sent: {error}")
 
     def failed(self, reason: str) -> None:
         """Something of ours has failed: the vehicle's part ends; any thread may tell."""

@@ -19,9 +19,11 @@ from typing import BinaryIO
 from swarmsim.autopilot.frames import yaw_of_quaternion
 from swarmsim.autopilot.link import Identity, LinkError, Mode, Setpoint, Telemetry, Vector
 from swarmsim.autopilot.outer_loop import Demand, LoopSettings, OuterLoop
+from swarmsim.autopilot.pulse import since_boot_s
 from swarmsim.config.errors import file_errors_told
 
 FRESH_S = 0.5  # an older position is not flown on
+PAUSE_S = 1.0  # between two periods: nothing was sent meanwhile, whatever the clocks say
 CLIMBED = 0.9  # of the height, from which on it has taken off
 _KEPT = 200  # messages
 
@@ -242,11 +244,19 @@ class StickLink(ABC):
 
     def _run(self) -> None:
         due = last = time.monotonic()
+        ran_s = since_boot_s()
         while not self._over.wait(max(0.0, due - time.monotonic())):
-            now = time.monotonic()
+            now, ran_before_s, ran_s = time.monotonic(), ran_s, since_boot_s()
+            if ran_s - ran_before_s > PAUSE_S:
+                self._forget_goal()
             self._tick(now, now - last)
             last = now
             due = max(due + self._period_s, now - self._period_s)
+
+    def _forget_goal(self) -> None:
+        """The program was stopped, or its computer suspended: where the vehicle was to go is long past."""
+        with self._lock:
+            self._goal = None
 
     def _demand(self, now_s: float, dt_s: float) -> tuple[Demand, float] | None:
         """What the setpoint demands, and the heading; None where there is no fresh one, or no fresh position."""

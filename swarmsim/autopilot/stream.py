@@ -10,7 +10,9 @@ import numpy as np
 
 from swarmsim.autopilot.guard import Guard, RefusedError
 from swarmsim.autopilot.link import Setpoint
+from swarmsim.autopilot.pulse import Pulse
 
+PAUSE_S = 1.0  # that the thread is late by, or ``stale_s`` if that is more: the program was stopped meanwhile
 PRIORITY = -10  # nice value of the thread; it needs a few microseconds in each period
 
 
@@ -18,8 +20,9 @@ class SetpointStream:
     """Sends the latest setpoint at a fixed rate until it is halted.
 
     A setpoint that is not renewed for ``stale_s`` is not sent again: then ``on_stale`` is called, once, with its age in
-    s, and the stream is silent until a new one is offered. One that is to be kept lasts ``kept_s``. `halt` takes effect
-    before it returns: no byte leaves afterwards.
+    s, and the stream is silent until a new one is offered. One that is to be kept lasts ``kept_s``. None outlasts a
+    pause of the program, which `pulse` notices: then ``on_stale`` is called as well. `halt` takes effect before it
+    returns: no byte leaves afterwards.
     """
 
     def __init__(
@@ -32,6 +35,8 @@ class SetpointStream:
         """
         self._send, self._guard, self._period_s = send, guard, 1.0 / rate_hz
         self._lasts_s = {False: stale_s, True: kept_s}
+        self.pulse = Pulse(max(PAUSE_S, stale_s))
+        self._pauses = 0  # that were seen here
         self._on_stale, self._on_error = on_stale, on_error
         self._lock = threading.Lock()  # held while a setpoint is sent
         self._latest: tuple[float, Setpoint] | None = None
@@ -93,11 +98,14 @@ class SetpointStream:
         with contextlib.suppress(OSError, AttributeError):  # where the system lets it, before what only computes
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), PRIORITY)
         due = time.monotonic()
+        self.pulse.beat()
         while not self._over.wait(max(0.0, due - time.monotonic())):
+            self.pulse.beat()
             try:
                 age_s = self._once()
             except Exception as error:  # a link may fail in any way; the flight is told
                 self._halted = True
+                self.pulse.end()
                 self._on_error(error)
                 return
             if age_s is not None:
@@ -106,16 +114,22 @@ class SetpointStream:
             due += self._period_s
             if due < now - self._period_s:  # the process was suspended: what is missed is not made up for
                 due = now
+        self.pulse.end()
 
     def _once(self) -> float | None:
         """Send what is due; the age of one that has just become stale, s."""
         with self._lock:
+            (pauses, paused_s), seen = self.pulse.pauses(), self._pauses
+            self._pauses = pauses
             if self._halted or self._latest is None:
                 if self._sent_s and np.isfinite(self._sent_s[-1]):
                     self._sent_s.append(np.nan)  # a pause
                 return None
             offered_s, setpoint = self._latest
             now = time.monotonic()
+            if pauses > seen:  # one that was offered since knows the vehicle's state from before
+                self._latest = None
+                return max(paused_s, now - offered_s)
             if now - offered_s > self._lasts_s[self._kept]:
                 self._latest = None
                 return now - offered_s
