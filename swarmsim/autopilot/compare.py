@@ -35,6 +35,7 @@ _SPEED_OVER_S = 1.0
 _MOVING_SHARE, _STANDING = 0.2, 0.1  # of the greatest speed: slower is standing, which counts so much in a shift
 _TIE_M = 0.5  # a shift over the whole search must make an rms better by as much as this
 _CHUNK = 256
+_HEIGHT_WEIGHT = 0.01  # of squared differences in height: 5 m count as half a metre aside
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,11 @@ def on_lines(speed_m_s: Floats) -> NDArray[np.bool_]:
 
 
 def nearest(places_m: ArrayLike, path_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Of places [n, 2] the horizontal distance [n] from a polyline [P, 3], and its height and arc length there [n]."""
+    """Of places the horizontal distance [n] from a polyline [P, 3], and its height and arc length there [n].
+
+    With places [n, 3] their heights tell apart the parts of a path that lie over each other, as where it climbs
+    upright or crosses itself; [n, 2] does without.
+    """
     places, path = np.asarray(places_m, np.float64), np.asarray(path_m, np.float64)
     if len(path) == 1:
         path = np.concatenate([path, path])
@@ -218,10 +223,13 @@ def nearest(places_m: ArrayLike, path_m: ArrayLike) -> tuple[Floats, Floats, Flo
     distance, height, arc = (np.full(len(places), np.nan) for _ in range(3))
     for first in range(0, len(places), _CHUNK):
         part = slice(first, first + _CHUNK)
-        offset = places[part, None] - start[:, :2]
+        offset = places[part, None, :2] - start[:, :2]
         share = np.clip(np.sum(offset * step[:, :2], axis=2) / np.maximum(length2, 1e-12), 0.0, 1.0)
         apart = np.sum((offset - share[..., None] * step[:, :2]) ** 2, axis=2)
-        best = np.argmin(apart, axis=1)
+        cost = apart
+        if places.shape[1] > 2:
+            cost = apart + _HEIGHT_WEIGHT * (places[part, None, 2] - start[:, 2] - share * step[:, 2]) ** 2
+        best = np.argmin(cost, axis=1)
         row = np.arange(len(best))
         distance[part] = np.sqrt(apart[row, best])
         height[part] = start[best, 2] + share[row, best] * step[best, 2]
@@ -239,7 +247,7 @@ def _from_paths(
         mine = np.flatnonzero((phase == k) | (phase < 0))
         if not len(path.points_m) or not len(mine):
             continue
-        apart, up, along = nearest(place_m[mine, :2], path.points_m)
+        apart, up, along = nearest(place_m[mine], path.points_m)
         closer = apart < distance[mine]
         rows = mine[closer]
         distance[rows], height[rows] = apart[closer], up[closer]

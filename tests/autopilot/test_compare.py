@@ -240,3 +240,18 @@ def test_statistics_of_magnitudes():
     assert statistics(np.array([np.nan, np.inf])) is None
     told = statistics(np.array([-3.0, 4.0, np.nan]))
     assert told == {"samples": 2, "rms_m": pytest.approx(12.5**0.5), "p95_m": pytest.approx(3.95), "max_m": 4.0}
+
+
+def test_on_the_way_up_and_where_a_path_crosses_itself_the_height_is_that_of_its_own_part():
+    """Up to 8 m over the start, away, and back over the first leg at 14 m."""
+    path = np.array([[0.0, 0, 0], [0, 0, 8], [20, 0, 8], [20, 10, 14], [10, -10, 14]])
+    fine = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(path)])
+    flown = along(path)
+    distance, height, _ = nearest(flown.position_m, fine)
+    np.testing.assert_allclose(height, flown.position_m[:, 2], atol=0.1)
+    assert distance.max() < 0.01
+    lifted = moved(flown, offset_m=(0.0, 0.3, 0.5))
+    level = lifted.position_m[:, 0] > 1.0
+    distance, height, _ = nearest(lifted.position_m[level], fine)
+    assert np.median(lifted.position_m[level, 2] - height) == pytest.approx(0.5, abs=0.05)
+    assert distance.max() < 0.31
