@@ -86,7 +86,7 @@ class Control:
         if self.state in (State.STARTS, State.FOLLOWS):
             if self._armed and paused:
                 self._raise(Alarm(Action.HOLD, stopped(paused_s)))
-            elif self._armed:
+            elif self._armed and self._mode is Mode.FOLLOW:  # or something else was asked for
                 self._raise(self._watch.check(t))
                 where = None if t.position_m is None else self._guard.left(t.position_m)
                 if where is not None:
@@ -202,7 +202,7 @@ class Control:
             self._stage("landed" if self.flies else "disarmed")
             self.state, self._armed, self._mode = State.STANDS, False, None
             return True
-        if t.mode is not self._mode and not t.failsafe and not self._lands_next(t):
+        if t.mode not in {self._mode, Mode.LAND if self._mode is Mode.RETURN else self._mode} and not t.failsafe:
             self._released(f"the operator took over with mode {t.mode_name}")
             return True
         if not self.flies and self._at_rest(t, now):
@@ -260,9 +260,6 @@ class Control:
             self._stage(f"it is in mode {t.mode_name}{'' if t.armed else ', disarmed'}; nothing more is asked of it")
 
     # Inside
-
-    def _lands_next(self, t: Telemetry) -> bool:
-        return self._mode is Mode.RETURN and t.mode is Mode.LAND
 
     def _at_rest(self, t: Telemetry, now_s: float) -> bool:
         moves = t.velocity_m_s is None or float(np.hypot(*t.velocity_m_s[:2])) > RESTS_M_S
@@ -346,13 +343,22 @@ class Control:
         self._settle()
         stuck = threading.Timer(self.settings.watchdogs.hold_s, self._on_stuck)
         stuck.daemon = True
+        if self._asks(Mode.HOLD, stuck):
+            stuck.start()
+
+    def ask(self, how: str) -> None:
+        """Ask for land or return from any thread: that of the flight, which is to `end`, may be stuck."""
+        self._asks(MODES[how if self.flies or how == "return" else "hold"], None)
+
+    def _asks(self, mode: Mode, stuck: threading.Timer | None) -> bool:
+        """Ask a vehicle that follows for a mode, unless the thread of the flight acts; ``stuck`` is for it to stop."""
         with self._lock:
             if self._acts or self._mode is not Mode.FOLLOW or self.link.telemetry().mode is not Mode.FOLLOW:
-                return
-            self._mode, self._asked_s, self._stuck = Mode.HOLD, time.monotonic(), stuck
+                return False
+            self._mode, self._asked_s, self._stuck = mode, time.monotonic(), stuck
         self.stream.halt()
-        self.link.request(Mode.HOLD)
-        stuck.start()
+        self.link.request(mode)
+        return True
 
     def _settle(self) -> None:
         """After a pause of this program look again: an operator may have taken over meanwhile."""

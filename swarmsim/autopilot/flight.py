@@ -212,8 +212,8 @@ class Flight:
             return True
         if flown_m is not None:
             self.live.join(self._body(t), flown_m)
-            self.helm.resume()
-            self._stage("mission")
+            if self.helm.resume():
+                self._stage("mission")
         elif self.helm.flies and self.helm.setpoint is not None:
             self.log.row(step.time_s, self.helm.setpoint, t, self.live.path_m, by_hand=True)
         return self.helm.flies

@@ -140,6 +140,18 @@ def test_a_held_key_asks_once(keyboard):
     assert board.read(4.0).events == (Event.HOLD, Event.LAND, Event.RETURN)
 
 
+def test_a_key_that_is_held_asks_once_whatever_delays_its_repetition(keyboard):
+    """A slow connection leaves gaps: the second press of a toggle would hand the vehicle back."""
+    board, types = keyboard
+    asked = []
+    for now in (0.0, 0.95, 1.0, 1.05, 1.9, 2.0, 2.8):
+        types(b" ")
+        asked += board.read(now).events
+    assert asked == [Event.TAKE_OVER]
+    types(b" ")
+    assert board.read(4.0).events == (Event.TAKE_OVER,)
+
+
 def test_what_can_be_done_is_told(keyboard):
     board, _ = keyboard
     assert "space: take over" in board.told(False)

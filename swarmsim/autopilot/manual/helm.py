@@ -17,6 +17,8 @@ from swarmsim.autopilot.manual.rejoin import Rejoin
 from swarmsim.autopilot.manual.sticks import CENTRED, Event, Reading, Source
 from swarmsim.config.autopilot import Autopilot
 
+STUCK_S = 1.0  # the flight has not acted on what the pilot asked for: it plans
+
 
 class Helm:
     """Decides whose setpoints are streamed: those that `offer` brings from the policy, or the pilot's.
@@ -40,6 +42,7 @@ class Helm:
         self._handing = False  # he has handed it back, and the mission has not taken it yet
         self._waits = False  # his sticks do not count until they are centred
         self._wish: Event | None = None
+        self._wished_s = 0.0
         self._rejoin: Rejoin | None = None
         self._flown_m = 0.0  # by the pilot since he took over
         self._before: Vector | None = None  # where it was then
@@ -85,11 +88,14 @@ class Helm:
         """How far the pilot has flown, m, where he wants the policy to go on: join, then `resume`."""
         return self._flown_m if self._handing else None
 
-    def resume(self) -> None:
-        """The policy flies again."""
+    def resume(self) -> bool:
+        """The policy flies again; False where the pilot has taken it back meanwhile."""
         with self._lock:
+            if not self._handing:
+                return False
             self._flies = self._handing = False
             self._rejoin = Rejoin(self._manual, self._guard, self._control.link.telemetry(), time.monotonic())
+            return True
 
     def wish(self) -> Event | None:
         """LAND or RETURN once, where the pilot asks for it; nobody flies it by setpoints then."""
@@ -135,8 +141,11 @@ class Helm:
         self._tell_lost(reading)
         with self._lock:
             for event in reading.events:
-                self._asked(event)
-            self._waits = self._waits and not reading.sticks.centred
+                self._asked(event, now_s)
+            if self._wish is not None and now_s - self._wished_s > STUCK_S:
+                self._control.ask(self._wish.value)
+            lost = reading.lost is not None  # found again, it may be anywhere
+            self._waits = lost or (self._waits and not reading.sticks.centred)
             if not self._flies or not self._follows:
                 self._begins = self._flies
                 return
@@ -156,19 +165,22 @@ class Helm:
     def _follows(self) -> bool:
         return self._control.state is State.FOLLOWS and self._control.alarm is None
 
-    def _asked(self, event: Event) -> None:
+    def _asked(self, event: Event, now_s: float) -> None:
         if self.over or self._control.state in _WORDS:
             return
         if event in (Event.LAND, Event.RETURN):
             if self._follows:
+                self._wished_s = now_s if self._wish is None else self._wished_s
                 self._wish = event
             else:
                 self._tell(f"it does not {event.value} now: it does not follow yet (Ctrl-C ends the flight)")
         elif not self._flies:
             self._take()
             self._waits = event is Event.HOLD
-        elif event is Event.HOLD:
-            self._waits = True
+        elif event is Event.HOLD or self._handing:
+            if self._handing:
+                self._tell("the pilot flies on")
+            self._waits, self._handing = event is Event.HOLD, False
         elif self._follows:
             self._handing = True
             self._tell("the pilot hands it back")

@@ -6,6 +6,7 @@ lost as well. (Steps of speed that last until another key, as in teleop_twist_ke
 held together a terminal repeats the last one only: the others end, which stops what they command.
 """
 
+import math
 import os
 import sys
 
@@ -16,6 +17,7 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.manual import Manual
 
 STEP = 0.1  # of a full stick, by the keys faster and slower
+AGAIN_S = 1.0  # a key that asks once must have been up for so long: gaps of a slow connection are no second press
 TYPED = 4  # different keys in one read: more were pasted, and are not obeyed
 
 _PAIRS = (("forward", "back"), ("left", "right"), ("climb", "sink"), ("turn_left", "turn_right"))
@@ -32,6 +34,7 @@ class Keyboard:
         self._terminal = Terminal(_standard_input() if fd is None else fd)
         self._decoder = KeyDecoder()
         self._until: dict[str, float] = {}  # of each action whose key is held: until when
+        self._seen_s: dict[str, float] = {}  # when each action's key was last seen
         self.share = manual.key_share
         """Deflection of a stick by a key."""
 
@@ -69,6 +72,8 @@ class Keyboard:
         if action is None:
             return []
         repeats = self._until.get(action, -1.0) >= now_s
+        asks = action in _EVENTS and now_s - self._seen_s.get(action, -math.inf) >= AGAIN_S
+        self._seen_s[action] = now_s
         self._until[action] = max(
             now_s + (self._manual.repeat_s if repeats else self._manual.first_s), self._until.get(action, -1.0)
         )
@@ -81,7 +86,7 @@ class Keyboard:
         if action in ("faster", "slower"):
             step = STEP if action == "faster" else -STEP
             self.share = min(1.0, max(STEP, round(self.share + step, 6)))
-        return [] if repeats or action not in _EVENTS else [_EVENTS[action]]
+        return [_EVENTS[action]] if asks else []
 
     def _sticks(self, now_s: float) -> Sticks:
         self._until = {action: until for action, until in self._until.items() if until >= now_s}
