@@ -191,7 +191,8 @@ def test_a_vehicle_whose_phase_begins_later_waits_on_the_ground(late):
     assert flight.log.ended == ""
     events = [what for _, what in flight.log.events]
     assert events.index("plan second") < events.index("arm") < events.index("mission")
-    assert max(s.position_m[0] for _, s in link.sent if s.position_m is not None) > -72.5
+    farthest = max(s.position_m[0] for _, s in link.sent if s.position_m is not None)
+    assert farthest > -72.75  # the point at -72 m, where it turns back, is passed half a metre before
     assert not link.armed
 
 
