@@ -15,7 +15,7 @@ from swarmsim.autopilot.convert import hold_at
 from swarmsim.autopilot.guard import Guard, RefusedError
 from swarmsim.autopilot.link import LinkError, Mode, Setpoint, Telemetry, Vector, VehicleLink
 from swarmsim.autopilot.pulse import stopped
-from swarmsim.autopilot.state import State
+from swarmsim.autopilot.state import ARMS, State
 from swarmsim.autopilot.stream import SetpointStream
 from swarmsim.autopilot.watch import Action, Alarm, Following, Watch
 from swarmsim.config.autopilot import Autopilot
@@ -115,7 +115,7 @@ class Control:
             self.stream.resume()
             self.offer(waiting, keep=True)
             time.sleep(STREAMED_S)
-        self._stage("arm")
+        self._stage(ARMS)
         link.follow(s.answer_s)
         self._mode = Mode.FOLLOW
         link.arm(s.answer_s)

@@ -2,6 +2,8 @@
 
 from enum import Enum
 
+ARMS = "arm"  # the stage of a flight from which on its vehicle may leave the ground
+
 
 class State(Enum):
     """Who moves the vehicle."""

@@ -1,13 +1,51 @@
 """A vehicle that is under way without a flight of ours: it is refused, or brought down (``--recover``)."""
 
+import json
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from swarmsim.autopilot.control import MODES, POLL_S, RESTS_M_S, RESTS_S
 from swarmsim.autopilot.link import LinkError, Mode, VehicleLink
 from swarmsim.config.autopilot import Autopilot
+
+
+class Mark:
+    """A file beside the folder of a flight's results, there from arming until the program has seen the flight's end.
+
+    It outlives a program that is killed, and with it what the next one must know: it may have been its vehicle's pilot.
+    """
+
+    def __init__(self, folder: Path, vehicle: str, link: str):
+        """Of a flight of ``vehicle`` over ``link`` whose results go to ``folder``."""
+        self._path = folder.with_name(f".{folder.name}.under-way")
+        self._vehicle, self._link, self._folder = vehicle, link, folder
+
+    def set(self) -> None:
+        """The vehicle is about to be armed."""
+        at = time.strftime("%Y-%m-%d %H:%M:%S")
+        self._path.write_text(json.dumps({"vehicle": self._vehicle, "link": self._link, "armed": at}), encoding="utf-8")
+
+    def clear(self) -> None:
+        """The flight has ended, or its vehicle was brought down."""
+        self._path.unlink(missing_ok=True)
+
+    def refuse(self) -> None:
+        """Raise `LinkError` if an earlier flight was broken off."""
+        if not self._path.exists():
+            return
+        try:
+            told = json.loads(self._path.read_text(encoding="utf-8"))
+            which = f"of {told['vehicle']}, armed at {told['armed']} over {told['link']},"
+        except (OSError, ValueError, KeyError, TypeError):
+            which = "into this folder"
+        raise LinkError(
+            f"an earlier flight {which} was broken off: its program ended without bringing the vehicle down. See where "
+            "the vehicle is, then have it land, or be found disarmed, by the same command with --recover land; after "
+            f"that it may fly again ({self._path} says so)"
+        )
 
 
 def refuse_under_way(link: VehicleLink) -> None:
@@ -21,6 +59,9 @@ def refuse_under_way(link: VehicleLink) -> None:
 
 def recover(link: VehicleLink, how: str, settings: Autopilot, tell: Callable[[str], None]) -> None:
     """Have a vehicle that is under way land or return (``how``), whoever left it there, until it is disarmed."""
+    if not link.telemetry().armed:
+        tell("it stands, disarmed")
+        return
     drives = link.identity.vehicle == "rover"
     mode = Mode.HOLD if drives and how == "land" else MODES[how]
     link.enter(mode, settings.answer_s)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from swarmsim.autopilot.link import VehicleLink
     from swarmsim.autopilot.manual.status import StatusLine
     from swarmsim.autopilot.manual.sticks import Source
+    from swarmsim.autopilot.under_way import Mark
     from swarmsim.config.autopilot import Autopilot
     from swarmsim.config.scenario import Scenario
     from swarmsim.runtime.live import LiveMission
@@ -51,6 +52,8 @@ def fly_mission(
     ``watch`` shows the flight in a viewer on this desktop, ``watch_url`` in one that runs there; a pilot may take the
     vehicle over with ``manual``.
     """
+    from swarmsim.autopilot.link import LinkError
+    from swarmsim.autopilot.under_way import Mark
     from swarmsim.config.scenario import load_scenario
     from swarmsim.results.out_folder import check_out
 
@@ -67,11 +70,16 @@ def fly_mission(
     if manual is not None and (dry_run or recover is not None):
         raise InputError.of("nobody flies in a dry run or to recover a vehicle: leave out --manual", path="--manual")
     console = Console()
-    if recover is not None:
-        return _recovered(link, profile, system, signing_key, recover, scenario, console)
     if dry_run:
         return _rehearsed(scenario, vehicle, console)
     folder = out if out is not None else Path("runs") / f"{scenario.mission.name}_{vehicle}"
+    mark = Mark(folder, vehicle, link)
+    if recover is not None:
+        return _recovered(link, profile, system, signing_key, recover, scenario, mark, console)
+    try:
+        mark.refuse()
+    except LinkError as error:
+        return _failed(error)
     check_out(folder, force)
     viewer = None
     if watch or watch_url is not None:
@@ -79,7 +87,9 @@ def fly_mission(
 
         viewer = live_address(watch_url)
     with _device(manual, scenario) as pilot:
-        return _flown(scenario, vehicle, link, profile, system, signing_key, folder, force, viewer, console, pilot)
+        return _flown(
+            scenario, vehicle, link, profile, system, signing_key, folder, force, viewer, console, pilot, mark
+        )
 
 
 def _device(manual: str | None, scenario: "Scenario") -> "AbstractContextManager[Source | None]":
@@ -97,8 +107,9 @@ def _device(manual: str | None, scenario: "Scenario") -> "AbstractContextManager
 
 
 def _recovered(
-    link: str, profile: str, system: int | None, key: Path | None, how: str, scenario: "Scenario", console: Console
-) -> int:
+    link: str, profile: str, system: int | None, key: Path | None, how: str, scenario: "Scenario", mark: "Mark",
+    console: Console,
+) -> int:  # fmt: skip
     """Have a vehicle that is under way land or return, whoever left it there."""
     from swarmsim.autopilot.link import LinkError
     from swarmsim.autopilot.opening import open_vehicle
@@ -108,6 +119,7 @@ def _recovered(
         vehicle = open_vehicle(link, profile=profile, system=system, key_file=key)
         try:
             recover(vehicle, how, scenario.mission.autopilot, partial(console.print, highlight=False))
+            mark.clear()
         finally:
             vehicle.close()
     except LinkError as error:
@@ -178,7 +190,7 @@ def _rehearsed(scenario: "Scenario", vehicle: str, console: Console) -> int:
 
 def _flown(
     scenario: "Scenario", name: str, link: str, profile: str, system: int | None, key: Path | None, folder: Path,
-    force: bool, viewer: str | None, console: Console, pilot: "Source | None",
+    force: bool, viewer: str | None, console: Console, pilot: "Source | None", mark: "Mark",
 ) -> int:  # fmt: skip
     from swarmsim.atomic_folder import claimed
     from swarmsim.autopilot.flight import Flight
@@ -186,6 +198,7 @@ def _flown(
     from swarmsim.autopilot.link import LinkError
     from swarmsim.autopilot.manual.status import StatusLine
     from swarmsim.autopilot.opening import log_suffix, open_vehicle
+    from swarmsim.autopilot.state import ARMS
     from swarmsim.playback.live import LiveView
 
     simulation, live = _built(scenario, name)
@@ -195,6 +208,12 @@ def _flown(
 
     flight: Flight | None = None
     screen = StatusLine(sys.stdout, lambda: "" if flight is None or flight.helm is None else flight.helm.line())
+
+    def tell(text: str) -> None:
+        if text == ARMS:
+            mark.set()
+        screen.tell(text)
+
     with claimed(folder):
         try:
             vehicle = open_vehicle(
@@ -212,7 +231,7 @@ def _flown(
             if viewer is not None:
                 view = LiveView(simulation, live, name, viewer)
             observer = None if view is None else view.observe
-            flight = Flight(vehicle, live, settings, outline, _flies(live), screen.tell, observer, pilot)
+            flight = Flight(vehicle, live, settings, outline, _flies(live), tell, observer, pilot)
             vehicle.on_mode(flight.on_telemetry)
             # a collection of the garbage among all that was compiled would stop the stream for half a second
             gc.collect()
@@ -225,6 +244,7 @@ def _flown(
             gc.enable()
             gc.unfreeze()
             vehicle.close()
+            mark.clear()
             if view is not None:
                 view.close()
         if flight is not None and flight.log.rows:

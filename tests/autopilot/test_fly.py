@@ -15,11 +15,12 @@ import pytest
 from rich.console import Console
 
 from swarmsim.autopilot.flown import FlownLog
-from swarmsim.autopilot.link import Identity, Setpoint, Telemetry
+from swarmsim.autopilot.link import Identity, LinkError, Setpoint, Telemetry
 from swarmsim.autopilot.standin.kinematic import KinematicBody
 from swarmsim.autopilot.standin.settings import load_settings
 from swarmsim.autopilot.standin.sockets import open_link
 from swarmsim.autopilot.standin.vehicle import Standin
+from swarmsim.autopilot.under_way import Mark
 from swarmsim.cli.entry import main
 from swarmsim.cli.fly import EXIT_FLIGHT, _free, _outcome, _write
 from swarmsim.results.out_folder import check_out
@@ -143,9 +144,11 @@ def in_flight(standin, then):
     ],
 )
 def test_what_happens_to_the_vehicle_ends_the_flight(autopilot, what, reason, tmp_path, capsys):
+    seen, marked = [], tmp_path / ".out.under-way"
     with standing_in(autopilot) as (standin, link):
 
         def happen():
+            seen.append(marked.exists())
             if what == "operator":
                 standin.operator_mode("AUTO.LOITER")
             elif what == "disarm":
@@ -156,6 +159,8 @@ def test_what_happens_to_the_vehicle_ends_the_flight(autopilot, what, reason, tm
         in_flight(standin, happen)
         code = main(["fly", "block.yaml", "--vehicle", "uav", "--link", link, "--out", "out"])
     assert code == 4
+    assert seen == [True]
+    assert not marked.exists()
     said = json.loads((tmp_path / "out" / "flown.json").read_text(encoding="utf-8"))
     assert any(word in said["ended"] for word in reason.split("|")), said["ended"]
     if what == "operator":
@@ -196,6 +201,25 @@ def test_a_vehicle_that_is_armed_is_refused_until_it_was_brought_down(capsys):
         assert "--recover" in capsys.readouterr().err
         assert main([*bench, "--recover", "land"]) == 0
         assert not standin.armed
+
+
+def test_a_flight_whose_program_was_killed_is_not_gone_on_with_until_told(tmp_path, capsys):
+    mark = Mark(tmp_path / "out", "uav", "udpin:127.0.0.1:1")
+    mark.set()  # as a program leaves it that is killed in flight
+    with standing_in("px4") as (_, link):
+        bench = ["fly", "block.yaml", "--vehicle", "uav", "--link", link, "--out", "out"]
+        for _ in range(2):
+            assert main(bench) == 4
+            assert "broken off" in (said := capsys.readouterr().err)
+            assert "--recover land" in said
+            assert "armed at 2" in said
+        assert not (tmp_path / "out").exists()
+        assert main([*bench, "--recover", "land"]) == 0
+        assert "disarmed" in capsys.readouterr().out
+    mark.refuse()
+    (tmp_path / ".out.under-way").write_text("{cut", encoding="utf-8")
+    with pytest.raises(LinkError, match="into this folder was broken off"):
+        mark.refuse()
 
 
 def test_the_log_of_an_earlier_flight_is_not_written_over(tmp_path):
