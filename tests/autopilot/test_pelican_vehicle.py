@@ -59,8 +59,9 @@ def test_the_operator_takes_over_with_the_switch():
         peer.serial_enabled = False
         until(lambda: bool(seen))
         assert (seen[0].mode, seen[0].failsafe) == (Mode.OTHER, False)
-        peer.serial_enabled = True  # given back: this side does not take it again by itself
+        time.sleep(0.3)  # what was on the line before the takeover was seen has come
         peer._control = None
+        peer.serial_enabled = True  # given back: this side does not take it again by itself
         for _ in range(10):
             link.send(Setpoint(velocity_m_s=(1.0, 0.0, 0.0)))
             time.sleep(0.05)

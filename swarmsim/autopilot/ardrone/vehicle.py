@@ -262,13 +262,16 @@ class ArdroneVehicle(StickLink):
         if now_s - max(self._heard_s or -math.inf, self._woken_s) > _WAKE_S:
             self._woken_s = now_s
             self._data.write(navdata.WAKE, None)
-        with self._lock:
-            phase, control = self._phase, self._control()
         if self._has(State.COM_LOST):
             with self._wire:
                 self._sequence.restart()
+        with self._lock:  # until it is sent: a takeover that is seen meanwhile would be followed by a command
+            self._command(now_s, dt_s)
+
+    def _command(self, now_s: float, dt_s: float) -> None:
+        """Send what this phase asks for."""
+        phase, airborne = self._phase, self._control() in AIRBORNE
         keep: list[tuple[at.Argument, ...]] = [("COMWDG",)] if self._has(State.COM_WATCHDOG) else []
-        airborne = control in AIRBORNE
         if phase is Phase.LAND:
             self._transmit(*keep, ("REF", at.REF_BASE), moves=True)
         elif phase is Phase.TAKE_OFF and not airborne:

@@ -243,9 +243,10 @@ class PelicanVehicle(StickLink):
             wanted |= packets.POLL_STATUS | packets.POLL_GPS
         self._ticks += 1
         self._write(packets.encode_poll(wanted))
-        command = self._command(now_s, dt_s)
-        if command is not None and not self.dry:
-            self._write(packets.encode_control(command))
+        with self._lock:  # until it is written: a takeover that is seen meanwhile would be followed by a command
+            command = self._command(now_s, dt_s)
+            if command is not None and not self.dry:
+                self._write(packets.encode_control(command))
 
     def _command(self, now_s: float, dt_s: float) -> Control | None:
         """The sticks of this period; None where the remote control has them."""
