@@ -25,9 +25,9 @@ PRINTED = "firmware.log"  # in each vehicle's folder
 
 
 def parameters_of(autopilot: str, vehicle: Multirotor | SkidSteer) -> dict[str, float]:
-    """Parameters by which the firmware knows the vehicle: its rotors, and the thrust that holds it in the air."""
+    """Parameters by which the firmware knows the vehicle: its rotors and the thrust that holds it, or its drive."""
     if isinstance(vehicle, SkidSteer):
-        return {}
+        return _drive(autopilot, vehicle)
     rotor = vehicle.rotor
     hover = np.sqrt(GRAVITY_M_S2 * vehicle.mass_kg / len(vehicle.rotors) / rotor.thrust_coefficient_n_s2)
     share = float(hover / rotor.speed_max_rad_s)
@@ -48,6 +48,21 @@ def parameters_of(autopilot: str, vehicle: Multirotor | SkidSteer) -> dict[str, 
             f"CA_ROTOR{number}_KM": moment,
         }
     return parameters
+
+
+def _drive(autopilot: str, vehicle: SkidSteer) -> dict[str, float]:
+    """Parameters of a skid-steer rover: full output is its greatest speed (as `plant` takes it), track and limits."""
+    control = vehicle.control
+    if autopilot == "ardupilot":
+        return {"CRUISE_SPEED": control.speed_max_m_s / 2, "CRUISE_THROTTLE": 50.0}
+    return {
+        "RD_WHEEL_TRACK": vehicle.wheels.track_m,
+        "RO_MAX_THR_SPEED": control.speed_max_m_s,
+        "RO_SPEED_LIM": control.speed_max_m_s,
+        "RO_ACCEL_LIM": control.acceleration_max_m_s2,
+        "RO_DECEL_LIM": control.acceleration_max_m_s2,
+        "RO_YAW_RATE_LIM": round(float(np.degrees(control.yaw_rate_max_rad_s)), 2),
+    }
 
 
 class Firmware:

@@ -136,7 +136,13 @@ def test_parameters_hold_the_vehicle_in_the_air():
     ardupilot = parameters_of("ardupilot", x500)
     assert ardupilot["MOT_THST_HOVER"] == pytest.approx(0.7696**2, abs=1e-3)
     assert parameters_of("ardupilot", load_named("vehicles", "dji_f550"))["FRAME_CLASS"] == 2
-    assert parameters_of("px4", load_named("vehicles", "husky")) == {}
+    husky = load_named("vehicles", "husky")
+    drive = parameters_of("px4", husky)
+    assert drive["RD_WHEEL_TRACK"] == husky.wheels.track_m
+    assert drive["RO_MAX_THR_SPEED"] == drive["RO_SPEED_LIM"] == husky.control.speed_max_m_s
+    assert drive["RO_YAW_RATE_LIM"] == pytest.approx(np.degrees(husky.control.yaw_rate_max_rad_s), abs=0.01)
+    cruise = parameters_of("ardupilot", husky)  # the throttle that drives at this speed: full output, full speed
+    assert cruise["CRUISE_SPEED"] / husky.control.speed_max_m_s == cruise["CRUISE_THROTTLE"] / 100.0
 
 
 @pytest.mark.parametrize(
