@@ -77,9 +77,10 @@ class Control:
                 self.takeover_s = seen, time.monotonic()
             self._raise(changed)
 
-    def watch(self) -> bool:
-        """Look for what is wrong, and act on it; whether the vehicle is still ours."""
-        self.stream.renew()
+    def watch(self, renew: bool = True) -> bool:
+        """Look for what is wrong and act on it; whether it is still ours. ``renew`` keeps what was offered."""
+        if renew:
+            self.stream.renew()
         t = self.link.telemetry()
         pauses, paused_s = self.stream.pulse.pauses()
         paused, self._pauses = pauses > self._pauses, pauses

@@ -5,6 +5,7 @@ of the mission's policy. The mission's time stands still while a phase is planne
 """
 
 import math
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,6 +24,7 @@ from swarmsim.autopilot.manual.sticks import Source
 from swarmsim.autopilot.under_way import refuse_under_way
 from swarmsim.config.autopilot import Autopilot
 from swarmsim.runtime.live import LiveMission, LiveStep
+from swarmsim.runtime.uninterrupted import uninterrupted
 from swarmsim.vehicles.state import RigidState
 
 LANDS_M = 1.2  # above where it started: a mission's descent below it ends with the autopilot's own landing
@@ -63,6 +65,7 @@ class Flight:
         self._waits = False  # it holds until its next phase
         self._landed_in: int | None = None  # phase that it ended by landing
         self._left = False  # its part in the mission has ended
+        self._planner: threading.Thread | None = None  # begins phases; nobody else may touch ``live`` meanwhile
 
     def on_telemetry(self, t: Telemetry) -> None:
         """Called by the link's reader whenever mode or arming may have changed."""
@@ -91,6 +94,8 @@ class Flight:
             if self.helm is not None:
                 self.helm.close()
             self.control.stream.close()
+            with uninterrupted():
+                self._planned()  # what it works on is not whole before
             if self.control.alarm is not None:  # the first cause, not what came of it
                 self.log.ended = self.control.alarm.reason
 
@@ -146,8 +151,27 @@ class Flight:
         self.log.event("plan " + ", ".join(step.begins))
         self._begin()
 
+    def _planned(self) -> None:
+        if self._planner is not None:
+            self._planner.join()
+
     def _begin(self) -> None:
-        self.live.begin_phases()
+        """Begin the phases that are due, with the watchdogs at work; a hold is not renewed, so that it ends in time."""
+        failed: list[BaseException] = []
+
+        def plan() -> None:
+            try:
+                self.live.begin_phases()
+            except BaseException as error:  # raised again by the thread of the flight
+                failed.append(error)
+
+        self._planner = threading.Thread(target=plan, name="planner", daemon=True)
+        self._planner.start()
+        while self._planner.is_alive():
+            self._planner.join(self.live.period_s)
+            self.control.watch(renew=False)
+        if failed:
+            raise failed[0]
         phase = self.live.phase()
         asked = phase is not None and phase != self._landed_in and not self._left
         self._wanted = asked and self.control.state is not State.FOLLOWS
