@@ -3,6 +3,7 @@
 import contextlib
 import os
 import pty
+import select
 import signal
 import subprocess
 import sys
@@ -237,7 +238,7 @@ JOB = """
 def until_said(fd, words, seconds=60.0):
     said, deadline = b"", time.monotonic() + seconds
     while words.encode() not in said:
-        assert time.monotonic() < deadline, said
+        assert select.select([fd], [], [], max(deadline - time.monotonic(), 0.0))[0], said
         said += os.read(fd, 1024)
     return said.decode()
 

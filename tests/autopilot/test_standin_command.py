@@ -81,6 +81,9 @@ def test_ctrl_c_ends_it():
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         start = time.monotonic()
-        _, errors = process.communicate(timeout=10.0)
+        try:
+            _, errors = process.communicate(timeout=10.0)
+        finally:
+            process.kill()
     assert time.monotonic() - start < 3.0
     assert errors.rstrip().endswith("KeyboardInterrupt")
