@@ -69,9 +69,10 @@ class ArdupilotPeer:
     def _run(self, port: int) -> None:
         magic = {16: 18458, 32: 29569}[self.channels]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-            wire.settimeout(0.2)
             frame = 0
             while not self._over.is_set():
+                # only before the first answer may nobody listen; later a frame asked for twice is answered twice
+                wire.settimeout(2.0 if frame else 0.2)
                 pulses = self.law(self.states)
                 pulses = [*pulses, *[0] * (self.channels - len(pulses))]
                 packet = struct.pack(f"<HHI{self.channels}H", magic, 400, frame, *pulses)
