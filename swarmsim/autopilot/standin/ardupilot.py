@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from swarmsim.autopilot.frames import yaw_of_quaternion
 from swarmsim.autopilot.standin.activities import Activity, Follow, TakeOff
 from swarmsim.autopilot.standin.body import Motion, Sensed
 from swarmsim.autopilot.standin.core import FORCE, Autopilot, Command
@@ -30,6 +31,7 @@ _ROVER = {
 }
 CIRCLE = 2  # bit of FENCE_TYPE
 FENCE_BRAKE_M_S2 = 2.5
+FENCE_LAG_S = 0.4  # by which a vehicle is late in slowing down
 FAILSAFE_RTL, FAILSAFE_HOLD = 1, 2
 ACCEPTED, FAILED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_FAILED
 
@@ -45,6 +47,7 @@ class ArduPilot(Autopilot):
         """As every autopilot."""
         self._setpoint_s = math.inf
         self._gcs_lost = False
+        self._estimate_failed = False
         super().__init__(*arguments, **fields)
 
     def mode_tables(self) -> tuple[dict[str, int], dict[str, str]]:
@@ -64,11 +67,11 @@ class ArduPilot(Autopilot):
         target = read_ardupilot(message, self.sensed, self.local, self.world_origin, self.home_altitude_m)
         if not self.armed:
             return
-        self._setpoint_s = self.time_s
         if self.flies and not self.airborne:  # take-off is a command of its own
             return
-        if target is not None and self._outside(target):
+        if target is not None and not self.reaches(target):
             return
+        self._setpoint_s = self.time_s
         if target is None:
             self.activity = self.resting()
         else:
@@ -97,6 +100,9 @@ class ArduPilot(Autopilot):
         if not force and not self.ready:
             self.text(mav.MAV_SEVERITY_CRITICAL, f"Arm: {self.why_not()}")
             return FAILED
+        if self._gcs_lost and not force:
+            self.text(mav.MAV_SEVERITY_CRITICAL, "Arm: GCS failsafe on")
+            return FAILED
         if self.role in ("land", "return") and self.flies:
             self.text(mav.MAV_SEVERITY_CRITICAL, f"Arm: {self.mode} mode not armable")
             return FAILED
@@ -123,7 +129,8 @@ class ArduPilot(Autopilot):
         if self.armed:
             self.text(mav.MAV_SEVERITY_INFO, "Disarming motors")
         super().disarm()
-        self.failsafe = False
+        self._estimate_failed = False
+        self._tell_failsafe()
 
     def take_off(self, command: Command) -> int:
         """Refused unless armed, in GUIDED and on the ground."""
@@ -136,6 +143,7 @@ class ArduPilot(Autopilot):
 
     def supervise(self) -> None:
         """Time-out of velocities, GCS failsafe, disarming on the ground."""
+        self._supervise_gcs()
         if not self.armed:
             return
         limit = self.parameters["GUID_TIMEOUT"]
@@ -144,7 +152,6 @@ class ArduPilot(Autopilot):
             if not self.flies:
                 self.text(mav.MAV_SEVERITY_WARNING, f"target not received last {limit:.0f}secs, stopping")
             self.activity = self.resting()
-        self._supervise_gcs()
         if self.flies and self.ground_s is not None and not isinstance(self.activity, TakeOff):
             delay = float(self.parameters["DISARM_DELAY"])
             if self.role not in ("land", "return") and delay > 0 and self.time_s - self.ground_s > delay:
@@ -152,30 +159,42 @@ class ArduPilot(Autopilot):
 
     def _supervise_gcs(self) -> None:
         last = self.heard.get(int(self.parameters["SYSID_MYGCS"]))
-        lost = last is not None and self.time_s - last > self.parameters["FS_GCS_TIMEOUT"]
-        if lost and not self._gcs_lost and self.parameters["FS_GCS_ENABLE"] > 0:
-            self.failsafe = True
-            self.text(mav.MAV_SEVERITY_WARNING, "GCS Failsafe")
-            action = FAILSAFE_RTL if self.flies else self.parameters["FS_ACTION"]
-            if self.flies and not self.airborne:
-                self.disarm()
-            elif self.role != "land" and action in (FAILSAFE_RTL, FAILSAFE_HOLD):
-                self.enter("RTL" if action == FAILSAFE_RTL else "HOLD")
-        elif self._gcs_lost and not lost:
-            self.failsafe = False
-            self.text(mav.MAV_SEVERITY_WARNING, "GCS Failsafe Cleared")
+        enabled = self.parameters["FS_GCS_ENABLE"] > 0
+        lost = enabled and last is not None and self.time_s - last > self.parameters["FS_GCS_TIMEOUT"]
+        if lost == self._gcs_lost:
+            return
         self._gcs_lost = lost
+        self._tell_failsafe()
+        if not lost:
+            self.text(mav.MAV_SEVERITY_WARNING, "GCS Failsafe Cleared")
+            return
+        self.text(mav.MAV_SEVERITY_WARNING, "GCS Failsafe")
+        action = FAILSAFE_RTL if self.flies else self.parameters["FS_ACTION"]
+        if self.flies and not self.airborne:
+            self.disarm()
+        elif self.armed and self.role != "land" and action in (FAILSAFE_RTL, FAILSAFE_HOLD):
+            self.enter("RTL" if action == FAILSAFE_RTL else "HOLD")
+
+    def _tell_failsafe(self) -> None:
+        """Its HEARTBEAT is critical while any failsafe lasts."""
+        self.failsafe = self._gcs_lost or self._estimate_failed
 
     def finished(self) -> None:
         """A take-off hovers at its top; a landing ends with the motors off."""
         if self.role in ("land", "return") and self.flies:
             self.disarm()
 
+    def take_over(self) -> None:
+        """The EKF failsafe is over."""
+        self._estimate_failed = False
+        self._tell_failsafe()
+
     def land_after_failure(self) -> None:
         """The EKF failsafe lands a copter and stops a rover."""
         mode = "LAND" if self.flies else "HOLD"
         if self.mode != mode and self.role != "manual" and self.parameters["FS_EKF_ACTION"]:
-            self.failsafe = True
+            self._estimate_failed = True
+            self._tell_failsafe()
             self.text(mav.MAV_SEVERITY_CRITICAL, f"EKF Failsafe: changed to {mode} Mode")
             self.enter(mode)
 
@@ -198,25 +217,32 @@ class ArduPilot(Autopilot):
         on = self.parameters["FENCE_ENABLE"] and int(self.parameters["FENCE_TYPE"]) & CIRCLE
         return float(self.parameters["FENCE_RADIUS"] - self.parameters["FENCE_MARGIN"]) if on else math.inf
 
-    def _outside(self, target: Target) -> bool:
+    def reaches(self, target: Target) -> bool:
+        """Not a position outside the fence."""
         x, y, _ = target.position_m
         if x is None or y is None:
-            return False
-        return math.hypot(x - self.home_m[0], y - self.home_m[1]) > self._fence_m
+            return True
+        return math.hypot(x - self.home_m[0], y - self.home_m[1]) <= self._fence_m
 
     def tick(self, sensed: Sensed) -> Motion:
         """As every autopilot, and no faster towards the fence than it can brake."""
         motion = super().tick(sensed)
-        if math.isinf(self._fence_m) or motion.hold_position or not self.flies:
+        if math.isinf(self._fence_m) or motion.hold_position:
             return motion
         out = sensed.position_m[:2] - self.home_m[:2]
         far = float(np.hypot(*out))
         if far < 0.1:
             return motion
         away, velocity = out / far, np.array(motion.velocity_m_s[:2])
-        limit = math.sqrt(2.0 * FENCE_BRAKE_M_S2 * max(self._fence_m - far, 0.0))
+        if not self.flies:
+            yaw = yaw_of_quaternion(sensed.quaternion)
+            velocity = motion.speed_m_s * np.array([math.cos(yaw), math.sin(yaw)])
+        late = FENCE_LAG_S * max(float(sensed.velocity_m_s[:2] @ away), 0.0)
+        limit = math.sqrt(2.0 * FENCE_BRAKE_M_S2 * max(self._fence_m - far - late, 0.0))
         over = float(velocity @ away) - limit
         if over <= 0.0:
             return motion
+        if not self.flies:  # it drives where it points, only slower
+            return replace(motion, speed_m_s=motion.speed_m_s * limit / (limit + over))
         x, y = velocity - over * away
         return replace(motion, velocity_m_s=(float(x), float(y), motion.velocity_m_s[2]))

@@ -23,6 +23,7 @@ from swarmsim.autopilot.standin.activities import Activity, Follow, Hold, Idle, 
 from swarmsim.autopilot.standin.body import Array, Motion, Sensed
 from swarmsim.autopilot.standin.parameters import Parameters
 from swarmsim.autopilot.standin.settings import Settings
+from swarmsim.autopilot.standin.targets import Target
 
 HEARD_AGAIN_S = 2.0
 """For how long a status text is not repeated."""
@@ -132,6 +133,10 @@ class Autopilot(ABC):
     def prearm_checks(self) -> int:
         """Result of a command to run the checks before arming."""
         return int(mav.MAV_RESULT_UNSUPPORTED)
+
+    def reaches(self, target: Target) -> bool:
+        """Whether it would fly to a position."""
+        return True
 
     @abstractmethod
     def land_after_failure(self) -> None:

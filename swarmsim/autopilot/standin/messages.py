@@ -41,6 +41,11 @@ CAPABILITIES = (
     | mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
 )
 
+BYTEWISE = 16
+"""MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE: integer parameters travel as the bits of a float."""
+INTERVAL_MAX_US = 2**31 - 1
+"""What MESSAGE_INTERVAL can say."""
+
 Build = Callable[[Autopilot], Any]
 
 
@@ -204,7 +209,17 @@ def autopilot_version(pilot: Autopilot) -> Any:
     number = major << 24 | minor << 16 | patch << 8 | 255
     zeros = bytes(8)
     return mav.MAVLink_autopilot_version_message(
-        CAPABILITIES, number, 0, 0, 0, zeros, zeros, zeros, 0, 0, 0x5357 << 8 | pilot.system
+        CAPABILITIES | (BYTEWISE if pilot.bit_patterns else 0),
+        number,
+        0,
+        0,
+        0,
+        zeros,
+        zeros,
+        zeros,
+        0,
+        0,
+        0x5357 << 8 | pilot.system,
     )
 
 
@@ -268,13 +283,16 @@ class Streams:
         if interval_us < 0 or (interval_us == 0 and name not in self._own):
             self._period.pop(name, None)
         else:
-            self._period[name] = interval_us * 1e-6 if interval_us > 0 else self._own[name]
+            self._period[name] = min(interval_us, INTERVAL_MAX_US) * 1e-6 if interval_us > 0 else self._own[name]
             self._due[name] = self._pilot.time_s
         return True
 
     def interval_us(self, number: int) -> int:
-        """Interval of a message, -1 where it is not sent."""
-        period = self._period.get(self._names.get(number, ""))
+        """Interval of a message, -1 where it is not sent and 0 where there is none of it."""
+        name = self._names.get(number)
+        if name is None:
+            return 0
+        period = self._period.get(name)
         return -1 if period is None else round(period * 1e6)
 
     def send(self, name: str) -> bool:

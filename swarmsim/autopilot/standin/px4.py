@@ -111,8 +111,8 @@ class PX4(Autopilot):
             return REJECTED
         if self.mode == "OFFBOARD" and not self.streams_setpoints:
             return REJECTED
-        if self.role == "land":
-            self.mode = self.intention = "AUTO.LOITER"
+        if self.role in _ENDS:
+            return REJECTED
         self.start_motors()
         return ACCEPTED
 

@@ -70,8 +70,9 @@ class Requests:
         """Do what one message says, if it is for this vehicle."""
         handler = self._handlers.get(message.get_type())
         system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+        whom = message.get_srcSystem(), message.get_srcComponent()
         mine = system in (0, self._pilot.system) and component in (0, self._pilot.component)
-        if handler is not None and mine and message.get_srcSystem() != self._pilot.system:
+        if handler is not None and mine and whom != (self._pilot.system, self._pilot.component):
             handler(message)
 
     def _heartbeat(self, message: Any) -> None:
@@ -112,7 +113,10 @@ class Requests:
 
     def _set_mode(self, message: Any) -> None:
         if message.base_mode & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-            self._pilot.set_mode(self._mode_named(message.custom_mode))
+            results = self._pilot.set_mode(self._mode_named(message.custom_mode))
+            if self._pilot.type_number == mav.MAV_AUTOPILOT_ARDUPILOTMEGA:
+                whom = message.get_srcSystem(), message.get_srcComponent()
+                self._pilot.send(mav.MAVLink_command_ack_message(message.get_msgId(), results[-1], 0, 0, *whom))
 
     def _mode_named(self, number: int) -> str | None:
         return next((name for name, known in self._pilot.modes.items() if known == number), None)
@@ -135,9 +139,12 @@ class Requests:
             altitude += pilot.home_altitude_m
         role = "hold" if pilot.type_number == mav.MAV_AUTOPILOT_PX4 else "follow"
         result = self._mode_of_role(role)
+        x, y, z = map(float, pilot.world_of(latitude, longitude, altitude))
+        target = Target(position_m=(x, y, z))
+        if result == ACCEPTED and not pilot.reaches(target):
+            return pilot.refused
         if result == ACCEPTED and (pilot.airborne or not pilot.flies):
-            x, y, z = map(float, pilot.world_of(latitude, longitude, altitude))
-            pilot.follow(Target(position_m=(x, y, z)))
+            pilot.follow(target)
         return result
 
     def _set_home(self, command: Command) -> int:

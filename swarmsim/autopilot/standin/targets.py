@@ -22,7 +22,7 @@ NOTHING: Axes = (None, None, None)
 
 POSITION_BITS, VELOCITY_BITS, ACCELERATION_BITS = 0x007, 0x038, 0x1C0
 YAW_BIT, YAW_RATE_BIT = 0x400, 0x800
-IGNORE_ALL = 0xFFF
+FORCE_BIT = 0x200
 YAW_RATE_MAX_RAD_S = 10.0
 FAR_M = 1e6
 """Largest component of a target; the physics is in single precision."""
@@ -56,8 +56,6 @@ class KilledError(Exception):
 def read_px4(message: Any, sensed: Sensed, local: Alignment, origin: Geodetic, home_m: float) -> Target:
     """The target of a setpoint that PX4 takes; raises `UnsupportedError` for one that it drops."""
     mask = message.type_mask
-    if mask & IGNORE_ALL == IGNORE_ALL:
-        raise UnsupportedError(f"type mask {mask:#x} commands nothing")
     frame = message.coordinate_frame
     if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
         if frame not in (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_NED):
@@ -68,7 +66,13 @@ def read_px4(message: Any, sensed: Sensed, local: Alignment, origin: Geodetic, h
         position = (message.x, message.y, message.z)
     else:
         position, body = _global(message, local, origin, home_m), False
-    return _target(message, mask, position, local, _heading(sensed) if body else None)
+    target = _target(message, mask, position, local, _heading(sensed) if body else None)
+    # a component that is no number is as one that the mask leaves out
+    if not any(_number(x) for x in (*target.position_m, *target.velocity_m_s, *target.acceleration_m_s2)):
+        raise UnsupportedError(f"type mask {mask:#x} commands nothing")
+    if mask & FORCE_BIT and any(_number(x) for x in target.acceleration_m_s2):
+        raise UnsupportedError("force")
+    return target
 
 
 def read_ardupilot(message: Any, sensed: Sensed, local: Alignment, origin: Geodetic, home_m: float) -> Target | None:
@@ -107,7 +111,9 @@ def read_ardupilot(message: Any, sensed: Sensed, local: Alignment, origin: Geode
         return None
     keep = (POSITION_BITS if not has_position else 0) | (VELOCITY_BITS if not has_velocity else 0)
     keep |= (ACCELERATION_BITS if not has_acceleration else 0) | (mask & (YAW_BIT | YAW_RATE_BIT))
-    given = (*_components(message, "v"), *_components(message, "a"))
+    given = (_components(message, "v") if has_velocity else ()) + (
+        _components(message, "a") if has_acceleration else ()
+    )
     if any(map(math.isnan, given)):
         return None
     return _target(message, keep, position, local, _heading(sensed) if turned else None)
@@ -117,6 +123,10 @@ def _components(message: Any, kind: str) -> Vector:
     names = ("vx", "vy", "vz") if kind == "v" else ("afx", "afy", "afz")
     x, y, z = (float(getattr(message, name)) for name in names)
     return x, y, z
+
+
+def _number(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
 
 
 def _heading(sensed: Sensed) -> float:
