@@ -3,15 +3,17 @@
 Two kinds of error are told apart, and neither stands for the other:
 
 - *Geometric*: the least horizontal distance of each place that was flown from a line, whenever it was flown: from the
-  planned path of its phase (cross-track error), and from the simulated track. A vehicle that is merely late has none.
+  planned path of its phase (cross-track error), and from the simulated track. A vehicle that is merely late has none:
+  the phase is the one that the simulated vehicle was in where it was next to that place, in the order of the flight.
 - *Time-synchronised*: the horizontal distance between the flown and the simulated vehicle at the same time, after one
   constant shift of time, the one with the least rms over what was flown (`time_shift_s`). It holds lags along the
   track, and whatever differs in take-off, corners and speed after that one shift. A flight's clock and a mission's have
   no common zero, so that without a shift the number would mean nothing.
 
 "Simulated against firmware in the loop, same mission" is the time-synchronised rms over the whole common time, nothing
-left out. "On the lines" leaves out corners, take-off and landing: samples where the horizontal speed (simulated, or
-flown where nothing was simulated) is below 0.7 of its greatest.
+left out; geometric errors are those of all that is judged, also before and after it. "On the lines" leaves out corners,
+take-off and landing: samples where the horizontal speed (simulated, or flown where nothing was simulated) is below 0.7
+of its greatest.
 """
 
 from collections.abc import Sequence
@@ -22,10 +24,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
 
+from swarmsim.autopilot.along_track import distance_from, matched
+
 Floats = NDArray[np.float64]
 ON_LINE_SHARE = 0.7  # of the greatest speed: slower parts are corners, take-off and landing
 STEP_S = 0.05  # of the times at which tracks are compared
-GAP_S = 1.0  # between two positions farther apart in time nothing is assumed
+GAP_S, GAP_PERIODS = 1.0, 2.5  # between positions farther apart, and so many times as usual, nothing is assumed
+GAP_MOST_S = 3.0
 CAP_M = 5.0  # what is farther apart fits no better or worse: several times what lags and estimates make
 CORNER_M = 0.5  # a path that bends by less is one leg
 LEG_M = 2.0  # shorter ones are corners
@@ -33,6 +38,7 @@ LONG_S = 50_000.0
 _COARSE_S, _COARSE_MAX, _SHIFTS_MAX = 0.25, 2000, 8000  # first search for the shift: step, most samples, most shifts
 _SPEED_OVER_S = 1.0
 _MOVING_SHARE, _STANDING = 0.2, 0.1  # of the greatest speed: slower is standing, which counts so much in a shift
+_COMMON_SHARE = 0.2  # of the shorter flight, for which both move at the same time at least
 _TIE_M = 0.5  # a shift over the whole search must make an rms better by as much as this
 _CHUNK = 256
 _HEIGHT_WEIGHT = 0.01  # of squared differences in height: 5 m count as half a metre aside
@@ -45,14 +51,20 @@ class Track:
     time_s: Floats
     position_m: Floats
 
+    @property
+    def gap_s(self) -> float:
+        """Longest time between two positions that is bridged: 1 s, or 2.5 times the usual one up to 3 s."""
+        usual = float(np.median(np.diff(self.time_s))) if len(self.time_s) > 1 else 0.0
+        return max(GAP_S, min(GAP_PERIODS * usual, GAP_MOST_S))
+
     def at(self, time_s: ArrayLike) -> Floats:
-        """Positions [m, 3] at ``time_s`` [m], linear in between; NaN outside, and in gaps longer than 1 s."""
+        """Positions [m, 3] at ``time_s`` [m], linear in between; NaN outside, and in gaps (`gap_s`)."""
         times = np.asarray(time_s, np.float64)
         if not len(self.time_s):
             return np.full((len(times), 3), np.nan)
         columns = [np.interp(times, self.time_s, column, np.nan, np.nan) for column in self.position_m.T]
         after = np.clip(np.searchsorted(self.time_s, times), 1, max(1, len(self.time_s) - 1))
-        gap = self.time_s[np.minimum(after, len(self.time_s) - 1)] - self.time_s[after - 1] > GAP_S
+        gap = self.time_s[np.minimum(after, len(self.time_s) - 1)] - self.time_s[after - 1] > self.gap_s
         return np.where(gap[:, None], np.nan, np.stack(columns, axis=1))
 
     def speed_m_s(self, time_s: Floats) -> Floats:
@@ -115,12 +127,15 @@ class Comparison:
         }
 
     def report(self) -> dict[str, Any]:
-        """Sums for a file: m and s; over the common time, on the lines alone, by phase, and by leg on the lines."""
+        """Sums for a file: m and s; over all that is judged, on the lines alone, by phase, and by leg on the lines."""
+        common = self.time_s[np.isfinite(self.synchronised_m)]
         everywhere = np.ones(len(self.time_s), bool)
         return {
             "time_shift_s": self.shift_s,
             "from_s": float(self.time_s[0]) if len(self.time_s) else None,
             "to_s": float(self.time_s[-1]) if len(self.time_s) else None,
+            "common_from_s": float(common[0]) if len(common) else None,
+            "common_to_s": float(common[-1]) if len(common) else None,
             "whole": self._of(everywhere),
             "on_lines": self._of(self.on_lines),
             "phases": [{"phase": name} | self._of(self.phase == k) for k, name in enumerate(self.phases)],
@@ -156,20 +171,22 @@ def compare(
     """The errors of a flown track, of which ``spans_s`` alone are judged if given."""
     judged = flown if spans_s is None else flown.within(spans_s)
     shift = None if simulated is None else time_shift_s(judged, simulated.track)
-    time_s = _times(judged, simulated, shift)
+    time_s = _times(judged)
     place = judged.at(time_s)
     known = np.isfinite(place).all(axis=1)
     time_s, place = time_s[known], place[known]
     nothing = np.full(len(time_s), np.nan)
     synchronised, above, apart, phase = nothing, nothing, nothing, np.full(len(time_s), -1)
-    leader, own = judged, time_s
-    if simulated is not None and shift is not None:
+    speed = judged.speed_m_s(time_s) if len(time_s) else nothing
+    if simulated is not None and shift is not None and len(time_s):
         leader, own = simulated.track, time_s - shift
         there = leader.at(own)
         synchronised = np.linalg.norm((place - there)[:, :2], axis=1)
         above = place[:, 2] - there[:, 2]
-        apart = nearest(place[:, :2], leader.position_m)[0] if len(place) else nothing
-        phase = simulated.phase[np.clip(np.searchsorted(leader.time_s, own), 0, len(leader.time_s) - 1)]
+        apart = distance_from(place, leader.position_m)
+        phase = simulated.phase[matched(place, leader.position_m)]
+        common = np.isfinite(synchronised)
+        speed[common] = leader.speed_m_s(own[common])
     elif len(planned) == 1:
         phase = np.zeros(len(time_s), int)
     distance, height, leg = _from_paths(place, planned, phase)
@@ -181,24 +198,21 @@ def compare(
         synchronised_m=synchronised,
         above_m=above,
         from_simulated_m=apart,
-        on_lines=on_lines(leader.speed_m_s(own)) if len(time_s) else np.zeros(0, bool),
+        on_lines=on_lines(speed),
         phase=np.asarray(phase),
         leg=leg,
         phases=tuple(path.phase for path in planned),
     )
 
 
-def _times(flown: Track, simulated: Simulated | None, shift: float | None) -> Floats:
-    """Evenly spaced times of the common part; in a very long one those of the flown track."""
+def _times(flown: Track) -> Floats:
+    """Evenly spaced times of what was flown; in a very long flight its own."""
     if not len(flown.time_s):
         return np.zeros(0)
     low, high = float(flown.time_s[0]), float(flown.time_s[-1])
-    if simulated is not None and shift is not None:
-        low = max(low, float(simulated.track.time_s[0]) + shift)
-        high = min(high, float(simulated.track.time_s[-1]) + shift)
     if high - low > LONG_S:
-        return flown.time_s[(flown.time_s >= low) & (flown.time_s <= high)]
-    return np.asarray(low + STEP_S * np.arange(max(0, int((high - low) / STEP_S + 1e-6)) + 1), np.float64)
+        return flown.time_s
+    return np.asarray(low + STEP_S * np.arange(int((high - low) / STEP_S + 1e-6) + 1), np.float64)
 
 
 def on_lines(speed_m_s: Floats) -> NDArray[np.bool_]:
@@ -281,9 +295,11 @@ def time_shift_s(flown: Track, simulated: Track) -> float | None:
     """What to add to the simulated times so that the horizontal distance of both at the same time has the least rms.
 
     Every shift is judged by all that was flown: the simulated vehicle stands at its ends before and after its track, so
-    that a flight may begin before it on the ground and be broken off at any time. Distances count up to `CAP_M` where
-    more than half of the flight fits so, as what follows when it is broken off belongs to no simulated track; where
-    it stands it hardly counts. Of shifts that fit equally well, as on laps, both set out together with the one taken.
+    that a flight may begin before it on the ground and be broken off at any time. Both are under way at the same time
+    for a fifth of the shorter flight at least. Distances count up to `CAP_M` where more than half of the flight fits
+    so, as what follows when it is broken off belongs to no simulated track; else it was flown elsewhere, and what all
+    distances have in common does not count. Where it stands it hardly counts. Of shifts that fit equally well, as on
+    laps, both set out together with the one taken.
     None where nothing was flown without gaps, or nothing simulated.
     """
     if len(flown.time_s) < 2 or len(simulated.time_s) < 2:
@@ -295,17 +311,21 @@ def time_shift_s(flown: Track, simulated: Track) -> float | None:
         return None
     step = max(_COARSE_S, span / _SHIFTS_MAX)
     shifts = low + step * np.arange(int(span / step) + 2)
-    errors = np.array([fit.squares(float(shift)) for shift in shifts])
-    together = _sets_out_s(flown) - _sets_out_s(simulated)
-    for cap in (CAP_M, np.inf):
+    moved, moves = _moving_s(flown), _moving_s(simulated)
+    together = moved[0] - moves[0]
+    both = np.minimum(moved[1], moves[1] + shifts) - np.maximum(moved[0], moves[0] + shifts)
+    enough = both >= _COMMON_SHARE * min(moved[1] - moved[0], moves[1] - moves[0])
+    for centred, cap in ((False, CAP_M), (True, np.inf)):
+        errors = np.array([fit.squares(float(shift), centred) for shift in shifts])
         rough = np.minimum(errors, cap**2) @ fit.weights + _TIE_M**2 * np.abs(shifts - together) / span
+        rough = np.where(enough, rough, np.inf) if enough.any() else rough
         best = int(np.argmin(rough))
         if float((errors[best] < CAP_M**2) @ fit.weights) > 0.5:
             break
     fine = _Fit.of(flown, simulated, STEP_S, 20_000) or fit
 
     def cost(shift: float) -> float:
-        return float(np.minimum(fine.squares(shift), cap**2) @ fine.weights)
+        return float(np.minimum(fine.squares(shift, centred), cap**2) @ fine.weights)
 
     first = float(shifts[best])
     near = minimize_scalar(cost, bounds=(first - step, first + step), method="bounded", options={"xatol": 1e-4})
@@ -333,11 +353,16 @@ class _Fit:
         weights = np.where(_moves(flown, times), 1.0, _STANDING)
         return cls(times, place, weights / np.sum(weights), simulated)
 
-    def squares(self, shift_s: float) -> Floats:
-        """Squares [n] of the distances from the simulated vehicle, which stands at its ends before and after."""
+    def squares(self, shift_s: float, centred: bool = False) -> Floats:
+        """Squares [n] of the distances from the simulated vehicle, which stands at its ends before and after.
+
+        ``centred``: without the part that is the same everywhere.
+        """
         own, track = self.time_s - shift_s, self.simulated
-        there = [np.interp(own, track.time_s, column) for column in track.position_m.T[:2]]
-        error: Floats = (self.place_m[:, 0] - there[0]) ** 2 + (self.place_m[:, 1] - there[1]) ** 2
+        there = np.stack([np.interp(own, track.time_s, column) for column in track.position_m.T[:2]], axis=1)
+        apart = self.place_m - there
+        apart = apart - self.weights @ apart if centred else apart
+        error: Floats = np.sum(apart * apart, axis=1)
         return error
 
 
@@ -348,9 +373,11 @@ def _moves(track: Track, time_s: Floats) -> NDArray[np.bool_]:
     return np.asarray(moves if moves.any() else ~moves)
 
 
-def _sets_out_s(track: Track) -> float:
+def _moving_s(track: Track) -> tuple[float, float]:
+    """When the vehicle sets out, and when it has arrived."""
     times = _grid(track, max(_COARSE_S, float(track.time_s[-1] - track.time_s[0]) / _COARSE_MAX))[0]
-    return float(times[int(np.argmax(_moves(track, times)))])
+    moves = np.flatnonzero(_moves(track, times))
+    return float(times[moves[0]]), float(times[moves[-1]])
 
 
 def _grid(track: Track, step_s: float) -> tuple[Floats, Floats]:

@@ -87,13 +87,20 @@ def read_simulated(folder: Path) -> tuple[Simulated, tuple[Planned, ...]]:
         time_s, points = np.asarray(table["time_s"]), np.stack([np.asarray(paths[name]) for name in _AXES], axis=1)
         position = np.stack([np.asarray(table[name]) for name in _AXES], axis=1)
         number, names = np.asarray(paths["path"]), paths["phase"].to_pylist()
-        phase = np.asarray(table["path"])
-    except (pa.ArrowException, KeyError, ValueError) as error:
+        phase = np.asarray(table["path"], np.int64)
+        track = np.column_stack([time_s, position]).astype(np.float64)
+        points = points.astype(np.float64)
+        whole = (
+            len(track) > 1 and np.isfinite(track).all() and np.isfinite(points).all() and (np.diff(time_s) > 0).all()
+        )
+        if not whole or not all(isinstance(name, str) for name in names) or phase.max() >= len(set(number.tolist())):
+            raise ValueError("no track")
+    except (pa.ArrowException, KeyError, ValueError, TypeError) as error:
         hint = "write the run anew, or name the mission with --mission and --vehicle"
-        raise InputError.of("is damaged", file=folder / SIMULATED, suggestion=hint) from error
+        raise InputError.of(f"is damaged, or {PLANNED} beside it", file=folder / SIMULATED, suggestion=hint) from error
     starts = [int(np.flatnonzero(number == k)[0]) for k in np.unique(number)]
     planned = tuple(Planned(str(names[start]), points[number == number[start]]) for start in starts)
-    return Simulated(Track(time_s, position), phase, seed), planned
+    return Simulated(Track(track[:, 0], track[:, 1:]), phase, seed), planned
 
 
 def simulate_vehicle(simulation: Simulation, vehicle: str) -> tuple[Simulated, tuple[Planned, ...]]:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from swarmsim.config.errors import InputError, file_errors_told
 from swarmsim.results.names import FIGURES, FLIGHT, LOG, RECORDING, SCENARIO
-from swarmsim.results.out_folder import READ_LOG, check_folder
+from swarmsim.results.out_folder import READ_LOG, check_folder, check_space, told_of
 
 if TYPE_CHECKING:
     from swarmsim.autopilot.compare import Comparison, Planned, Simulated
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 TRACK = "track.parquet"
 _MODES = 12  # lines of the table
+_FAR_M = 1000.0  # from the mission, which is told
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,10 @@ def replay_log(
     console = Console()
     place = None if origin is None else _geodetic(origin)
     folder = out if out is not None else Path("runs") / f"log_{file.stem}"
-    check_folder(folder, force, READ_LOG)
-    source = _source(run, mission, vehicle)
+    with told_of(folder):
+        check_folder(folder, force, READ_LOG)
+        check_space(folder)
+    source = _source(run, mission, vehicle, seed, overrides)
     log = read_log(file, system)
     if place is not None and log.origin is None:
         raise InputError.of(
@@ -57,6 +60,8 @@ def replay_log(
         console.print(f"note: {escape(note)}", highlight=False, soft_wrap=True)
     log = log if place is None else log.moved_to(place)
     found = None if source is None else _mission(*source, seed, overrides, run, console)
+    if found is not None and place is not None:
+        _tell_far(log, found, console)
     aligned = "the log's origin" if place is None else f"--origin {origin}"
     if found is not None and place is None:
         log, aligned = _aligned(log, found), "where the flight began"
@@ -78,16 +83,21 @@ def _geodetic(text: str) -> "Geodetic":
     return Geodetic(latitude, longitude, altitude)
 
 
-def _source(run: Path | None, mission: str | None, vehicle: str | None) -> tuple[str, str] | None:
+def _source(
+    run: Path | None, mission: str | None, vehicle: str | None, seed: int | None, overrides: Sequence[str]
+) -> tuple[str, str] | None:
     """Mission file or name, and vehicle, that the log is compared with; None where none is named."""
     if run is not None and mission is not None:
         raise InputError.of("name a run or a mission, not both", path="--run")
     if run is None and mission is None:
-        if vehicle is not None:
-            raise InputError.of("of which mission?", path="--vehicle", suggestion="add --mission or --run")
+        for option, given in (("--vehicle", vehicle), ("--seed", seed), ("--set", overrides or None)):
+            if given is not None:
+                raise InputError.of("of which mission?", path=option, suggestion="add --mission or --run")
         return None
     if run is not None:
-        if not (run / SCENARIO).is_file():
+        with file_errors_told("cannot be read", path="--run", given=str(run)):
+            whole = (run / SCENARIO).is_file()
+        if not whole:
             raise InputError.of(f"is not the folder of a run (no {SCENARIO} in it)", path="--run", given=str(run))
         vehicle = vehicle or _flown_vehicle(run)
         mission = str(run / SCENARIO)
@@ -99,7 +109,10 @@ def _source(run: Path | None, mission: str | None, vehicle: str | None) -> tuple
 def _flown_vehicle(run: Path) -> str | None:
     """The vehicle that was flown outside in a run."""
     try:
-        return str(json.loads((run / FLIGHT).read_text(encoding="utf-8"))["vehicle"])
+        name = json.loads((run / FLIGHT).read_text(encoding="utf-8"))["vehicle"]
+        if not isinstance(name, str):
+            raise TypeError(name)
+        return name
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -122,7 +135,8 @@ def _mission(
         )
     use_all_cores()
     simulation = build(scenario)
-    if run is not None and has_simulated(run) and vehicle == _flown_vehicle(run) and not overrides and seed is None:
+    as_flown = run is not None and has_simulated(run) and not overrides and seed is None
+    if run is not None and as_flown and vehicle == _flown_vehicle(run):
         simulated, planned = read_simulated(run)
     else:
         with console.status("fly the mission in simulation"):
@@ -130,9 +144,22 @@ def _mission(
     return _Mission(vehicle, simulation.site_model, simulated, planned)
 
 
+def _tell_far(log: "FlightLog", mission: _Mission, console: Console) -> None:
+    """A note where the flight with its given origin lies elsewhere than the mission."""
+    apart = log.position_m[0] - mission.simulated.track.position_m[0]
+    far = float(np.hypot(apart[0], apart[1]))
+    if far > _FAR_M:
+        console.print(
+            f"note: the flight begins {far / 1e3:,.1f} km from the vehicle's start in the mission: is --origin right "
+            "(latitude, longitude, altitude of the site's origin)?", highlight=False, soft_wrap=True,
+        )  # fmt: skip
+
+
 def _aligned(log: "FlightLog", mission: _Mission) -> "FlightLog":
-    """The log with the place where its flight began laid on the vehicle's start in the mission."""
-    began = int(np.searchsorted(log.time_s, log.spans_s()[0][0]))
+    """The log with the place where it was armed, or else where its flight began, laid on its start in the mission."""
+    began_s = log.spans_s()[0][0]
+    began_s = max((c.time_s for c in log.armed if c.name == "armed" and c.time_s <= began_s), default=began_s)
+    began = int(np.searchsorted(log.time_s, began_s))
     start = log.position_m[min(began, len(log.time_s) - 1)]
     return log.shifted(mission.simulated.track.position_m[0] - start)
 
@@ -165,7 +192,8 @@ def _write(
     summary |= {"vehicle_of_mission": mission.vehicle, "comparison": made.report()} if mission else {}
     told = file_errors_told("the results cannot be written there", path="--out", given=str(folder))
     with told, atomic_folder(folder, lambda target: check_folder(target, force, READ_LOG)) as new:
-        pq.write_table(track_table(log), new / TRACK, compression="zstd")
+        origin = "the log's origin" if mission is None else f"the mission's origin, laid over it by {aligned}"
+        pq.write_table(track_table(log, origin), new / TRACK, compression="zstd")
         (new / LOG).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         write_track_recording(overlay, site_model, new / RECORDING)
         write_figure(overlay, site_model, new / FIGURES)
@@ -206,4 +234,7 @@ def print_comparison(summary: dict[str, Any], console: Console) -> None:
     if table.row_count:
         console.print(table)
     else:
-        console.print("nothing of the flight can be compared with the mission: see 'Judged'", highlight=False)
+        console.print(
+            "nothing of the flight can be compared with the mission: see 'Judged', and whether positions are rare",
+            highlight=False,
+        )

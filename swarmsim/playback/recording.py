@@ -47,6 +47,7 @@ from swarmsim.site.model import SiteModel
 
 SAMPLES_MAX = 80_000  # of all phases: about 3 MB; more are thinned, each vehicle alike
 MAP_SNAPSHOTS = 30
+_FLUSH_S = 300.0  # that the rest of a recording may take to be written
 SPECTRUM_BARS = 256  # as many as a quarter of a screen can show
 MAP_ABOVE_GROUND_M = 0.35
 MAP_OPACITY = 190  # of 255
@@ -103,8 +104,11 @@ def _stream(path: Path, recording_id: str, layout: rrb.Blueprint) -> Iterator[rr
         stream.set_log_time_enabled(False)
         stream.save(path, default_blueprint=layout)
         yield stream
-        stream.flush()
-        stream.disconnect()
+        try:
+            stream.flush(timeout_sec=_FLUSH_S)
+            stream.disconnect()
+        except RuntimeError as error:  # the thread that writes has met a full disk, which it alone knows of
+            raise OSError(f"the recording could not be written: {error}") from error
 
 
 @contextmanager

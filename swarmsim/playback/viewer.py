@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from swarmsim.config.errors import InputError
+from swarmsim.config.errors import InputError, file_errors_told
 from swarmsim.config.names import one_of
 from swarmsim.results.names import RECORDING
 
@@ -22,7 +22,9 @@ _OPENS_S = 0.5
 
 def recording_of(run: Path) -> Path:
     """The recording of ``run``, which is a run's folder or a recording itself; `InputError` where there is none."""
-    if not run.exists():
+    with file_errors_told("cannot be read", given=str(run)):
+        there = run.exists()
+    if not there:
         runs = sorted(str(path.parent) for path in Path("runs").glob(f"*/{RECORDING}"))
         allowed = one_of(runs) if runs else f"the folder of a run, with {RECORDING} in it; there is none in runs/ yet"
         raise InputError.of("there is no such run", given=str(run), allowed=allowed)
@@ -33,9 +35,9 @@ def recording_of(run: Path) -> Path:
 
 
 def viewer_command(recording: Path, web: bool) -> list[str]:
-    """The command that shows ``recording``: on the desktop, or in the browser, served to this machine alone."""
-    command = [sys.executable, "-m", "rerun", str(recording)]
-    return [*command, "--web-viewer", "--bind", "127.0.0.1"] if web else command
+    """The command that shows ``recording``, on the desktop or in the browser, to this machine alone."""
+    command = [sys.executable, "-m", "rerun", str(recording), "--bind", "127.0.0.1"]
+    return [*command, "--web-viewer"] if web else command
 
 
 def open_recording(run: Path, web: bool = False) -> None:
@@ -56,7 +58,7 @@ def live_address(url: str | None, port: int = LIVE_PORT) -> str:
     """
     if url is None:
         if not _answers("127.0.0.1", port):
-            _start_viewer([sys.executable, "-m", "rerun", "--port", str(port)], port)
+            _start_viewer([sys.executable, "-m", "rerun", "--port", str(port), "--bind", "127.0.0.1"], port)
         return f"rerun+http://127.0.0.1:{port}/proxy"
     try:
         parts = urlsplit(url)

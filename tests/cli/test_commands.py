@@ -353,8 +353,8 @@ def test_view_opens_the_recording(
     assert "holds no recording" in capsys.readouterr().err
     for arguments in (["runs/recon"], ["runs/recon/mission.rrd", "--web"], ["runs/recon"]):
         cli.main(["view", *arguments])
-    assert commands[0] == ["-m", "rerun", "runs/recon/mission.rrd"]
-    assert commands[1] == ["-m", "rerun", "runs/recon/mission.rrd", "--web-viewer", "--bind", "127.0.0.1"]
+    assert commands[0] == ["-m", "rerun", "runs/recon/mission.rrd", "--bind", "127.0.0.1"]
+    assert commands[1] == ["-m", "rerun", "runs/recon/mission.rrd", "--bind", "127.0.0.1", "--web-viewer"]
     assert "viewer ended with exit code -2" in capsys.readouterr().err
 
 

@@ -3,11 +3,13 @@
 import json
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from swarmsim.autopilot.compare import Planned, Simulated, Track
-from swarmsim.autopilot.frames import geodetic_of_enu
+from swarmsim.autopilot.frames import geodetic_of_enu, ned_of_enu
 from swarmsim.autopilot.simulated_track import write_simulated
 from swarmsim.cli.entry import main
 from swarmsim.config.scenario import load_scenario
@@ -115,6 +117,11 @@ def test_a_flight_laid_over_by_its_place_on_the_earth(run, tmp_path, capsys):
         (["flight.tlog", "--run", "runs/circle", "--vehicle", "none"], "no such vehicle"),
         (["flight.tlog", "--mission", "circle.yaml"], "which vehicle"),
         (["flight.tlog", "--system", "9"], "no such system"),
+        (["flight.tlog", "--seed", "4"], "--seed: of which mission"),
+        (["flight.tlog", "--set", "seed=3"], "--set: of which mission"),
+        (["flight.tlog", "--out", "b" * 300], "cannot be written"),
+        (["flight.tlog", "--run", "b" * 300], "cannot be read"),
+        (["b" * 300 + ".tlog"], "File name too long"),
         (["flight.tlog", "--origin", "49,16"], "LAT,LON,ALT"),
         (["flight.tlog", "--origin", "nan,16,0"], "LAT,LON,ALT"),
         (["circle.yaml"], "no log"),
@@ -143,3 +150,56 @@ def test_a_log_without_a_place_on_the_earth(tmp_path, capsys):
     assert main(["replay-log", "flight.tlog", "--origin", "49,16,200"]) == 2
     assert "leave --origin out" in capsys.readouterr().err
     assert main(["replay-log", "flight.tlog"]) == 0
+
+
+NO_NUMBERS = {"nan": [np.nan], "text": ["here"], "nothing": [None]}
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("simulated.parquet", lambda table: table.slice(0, 0)),
+        ("simulated.parquet", lambda table: table.set_column(0, "time_s", pa.array([1.0] * len(table)))),
+        *(
+            (
+                name,
+                lambda table, v=values: table.set_column(
+                    table.column_names.index("east_m"), "east_m", pa.array(v * len(table))
+                ),
+            )
+            for name in ("simulated.parquet", "planned.parquet")
+            for values in NO_NUMBERS.values()
+        ),
+    ],
+)
+def test_damaged_tracks_of_the_run_are_told(name, spoil, run, capsys):
+    table = spoil(pq.read_table(run / name))
+    pq.write_table(table, run / name)
+    assert main(["replay-log", "flight.tlog", "--run", str(run)]) == 2
+    assert "is damaged" in capsys.readouterr().err
+
+
+def test_a_flight_that_was_taken_off_by_hand_begins_where_it_was_armed(run, tmp_path, capsys):
+    """Armed 8 m west of where it begins to follow setpoints, 3 m lower."""
+    log, before = writers.Tlog(), np.array([-8.0, 0.0, -3.0])
+    first = int(np.searchsorted(TRUTH.time_s, writers.ARMED_S))
+    place = TRUTH.position_m.copy()
+    place[:first] = place[first] + np.linspace(1.0, 0.0, first)[:, None] * before
+    for k, t in enumerate(TRUTH.time_s):
+        mode = 6 << 16 if k >= first and t < writers.LEFT_S else 3 << 16
+        log.put(t, mavlink.MAVLink_heartbeat_message(2, 12, 1 | 128, mode, 4, 3))
+        log.put(t, mavlink.MAVLink_local_position_ned_message(
+            round(t * 1e3), *ned_of_enu(place[k]), *ned_of_enu(TRUTH.velocity_m_s[k])))  # fmt: skip
+    (tmp_path / "hand.tlog").write_bytes(bytes(log.data))
+    assert main(["replay-log", "hand.tlog", "--run", str(run), "--out", "out"]) == 0
+    made = json.loads((tmp_path / "out" / "log.json").read_text(encoding="utf-8"))["comparison"]
+    assert made["whole"]["synchronised"]["rms_m"] == pytest.approx(8.0, abs=0.1)
+    assert made["whole"]["above_simulated"]["rms_m"] == pytest.approx(3.0, abs=0.1)
+    capsys.readouterr()
+
+
+def test_an_origin_elsewhere_on_the_earth_is_told(run, capsys):
+    assert main(["replay-log", "flight.tlog", "--run", str(run), "--origin", "49.4,16.5747,280"]) == 0
+    said = capsys.readouterr().out
+    assert "19.2 km" in said or "19.1 km" in said
+    assert "is --origin right" in said

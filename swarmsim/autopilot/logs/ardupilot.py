@@ -106,6 +106,10 @@ def _track(messages: dict[str, Messages], notes: list[str]) -> Collected | None:
         return None
     rows = messages["POS"]
     places = np.stack([rows.numbers(name) for name in ("Lat", "Lng", "Alt")], axis=1)
+    known = np.isfinite(places).all(axis=1) & (np.abs(places[:, :2]).sum(axis=1) > 0.0)  # before its first fix
+    if not known.any():
+        return None
+    rows, places = rows.where(known), places[known]
     origin = origin or Geodetic(*(float(value) for value in places[0]))
     notes.append("the log has no messages of the state estimate (XKF1): positions are those of POS, to about 1 cm")
     position = ned_of_enu(enu_of_places(places, origin))
@@ -146,7 +150,8 @@ def _with_the_rest(found: Collected, messages: dict[str, Messages], profile: Pro
     if "BAT" in messages:
         battery = messages["BAT"]
         battery = battery.where(battery.numbers("Inst") == 0) if battery.has("Inst") else battery
-        battery = battery.where(battery.numbers("RemPct") <= 100.0)  # 255 where it is not known
+        left = battery.numbers("RemPct")
+        battery = battery.where((left >= 0.0) & (left <= 100.0))  # 255 where it is not known
         found.battery = Series(_seconds(battery), battery.numbers("RemPct") / 100.0)
     found.setpoints_ned_m = _targets(messages)
     return found

@@ -23,6 +23,7 @@ _TOPICS = [
     "trajectory_setpoint",
 ]
 _FIELDS_MAX = 5000  # of a topic, arrays counted in full; those of PX4 have fewer than 300
+_WHOLE_MAX = 2.0**31
 _DEPTH_MAX = 10  # of topics in topics
 _HEADER_BYTES = 3  # of a message
 _ARMED = 2  # vehicle_status.arming_state
@@ -58,11 +59,11 @@ def read_ulog(path: Path, size: int, system: int | None) -> FlightLog:
     for data in reversed(log.data_list):  # of several estimators or batteries the first
         topics[data.name] = data.data
     status = topics.get("vehicle_status", {})
-    number = int(status["system_id"][-1]) if "system_id" in status else None
+    number = _whole(status["system_id"][-1:])[0] if "system_id" in status else None
     if system is not None and system != number:
         allowed = "the log does not tell its system" if number is None else f"{number} alone"
         raise InputError.of("the log has no such system", path="--system", given=str(system), allowed=allowed)
-    kind = int(status["system_type"][-1]) if "system_type" in status else mavlink.MAV_TYPE_GENERIC
+    kind = _whole(status["system_type"][-1:])[0] if "system_type" in status else mavlink.MAV_TYPE_GENERIC
     autopilot, profile = profile_of(mavlink.MAV_AUTOPILOT_PX4, kind)
     track = _track(topics.get("vehicle_local_position", {}))
     if track is None:
@@ -119,6 +120,12 @@ def _seconds(topic: Topic) -> Floats:
     return np.asarray(topic["timestamp"], np.float64) * 1e-6
 
 
+def _whole(values: Any) -> list[int]:
+    """Whole numbers; -1 where a damaged log has none."""
+    numbers = np.asarray(values, np.float64)
+    return [int(v) for v in np.where(np.abs(numbers) < _WHOLE_MAX, numbers, -1.0)]
+
+
 def _vectors(topic: Topic, *names: str) -> Floats:
     return np.stack([np.asarray(topic[name], np.float64) for name in names], axis=1)
 
@@ -159,7 +166,7 @@ def _add(found: Collected, topics: dict[str, Topic], log: ULog, profile: Profile
     status = topics.get("vehicle_status", {})
     if _has(status, "timestamp", "nav_state"):
         names = {} if profile is None else profile.autopilot.nav_states
-        modes = [names.get(int(n), f"nav_state {int(n)}") for n in status["nav_state"]]
+        modes = [names.get(n, f"nav_state {n}") for n in _whole(status["nav_state"])]
         found.modes = list(zip(_seconds(status), modes, strict=True))
     if _has(status, "timestamp", "arming_state"):
         found.armed = list(zip(_seconds(status), (status["arming_state"] == _ARMED).tolist(), strict=True))

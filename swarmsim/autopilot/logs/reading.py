@@ -24,7 +24,9 @@ def read_log(path: Path, system: int | None = None) -> FlightLog:
     is no such log, or holds no position of the vehicle.
     """
     path = Path(path)
-    if path.is_dir():
+    with file_errors_told("the log cannot be read", file=path):
+        folder = path.is_dir()
+    if folder:
         raise InputError.of("is a folder, not a log", file=path, allowed=ALLOWED)
     try:
         with file_errors_told("the log cannot be read", file=path):

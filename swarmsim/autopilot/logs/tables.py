@@ -11,8 +11,11 @@ from swarmsim.autopilot.logs.flight_log import Change, FlightLog, Floats
 MESSAGES_MAX = 1000  # in a report
 
 
-def track_table(log: FlightLog) -> pa.Table:
-    """One row for each position: time s, position m, velocity m/s, attitude, mode, arming, battery, setpoint m."""
+def track_table(log: FlightLog, origin: str = "the log's origin") -> pa.Table:
+    """One row for each position: time s, position m, velocity m/s, attitude, mode, arming, battery, setpoint m.
+
+    ``origin`` says in words what the positions are relative to.
+    """
     time_s = log.time_s
     columns: dict[str, Any] = {"time_s": time_s}
     for name, unit, values in (("", "_m", log.position_m), ("velocity_", "_m_s", log.velocity_m_s)):
@@ -23,10 +26,8 @@ def track_table(log: FlightLog) -> pa.Table:
     columns["battery"] = _latest(log.battery.time_s, log.battery.values[:, None], time_s)[:, 0]
     setpoint = _latest(log.setpoints.time_s, log.setpoints.values, time_s)
     columns |= {f"setpoint_{axis}_m": setpoint[:, k] for k, axis in enumerate(("east", "north", "up"))}
-    frame = (
-        "ENU about the log's origin; quaternion w x y z, body (forward left up) to world; time from the first position"
-    )
-    return pa.table(columns, metadata={"frame": frame})
+    frame = "quaternion w x y z, body (forward left up) to world; time from the first position"
+    return pa.table(columns, metadata={"frame": f"ENU about {origin}; {frame}"})
 
 
 def report(log: FlightLog) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from swarmsim.autopilot.frames import Geodetic, enu_of_places, geodetic_of_enu, ned_of_enu
+from swarmsim.autopilot.frames import Geodetic, enu_of_ned, enu_of_places, geodetic_of_enu, ned_of_enu
 from swarmsim.autopilot.logs.flight_log import (
     UNKNOWN,
     Collected,
@@ -36,7 +36,10 @@ from swarmsim.config.errors import InputError
 Data = bytes | mmap.mmap
 _STAMP = struct.Struct(">Q")
 _EPOCHS_US = (631_152_000_000_000, 4_102_444_800_000_000)  # 1990 to 2100: another time stamp is none
-_RESTART_S = 1.0
+_RESTART_S, _YOUNG_S = 30.0, 10.0  # a clock so far back, or back and so young, began anew; else it is an old message
+_BACK_S = 1.0
+_DENSE, _SPARSE_S = 1.5, 0.4  # global positions are taken where they are so many times as many, and local ones so rare
+_PAIR_S = 1.1  # longest time between two local positions about a global one
 _POSITION_IGNORED = 0x7  # of SET_POSITION_TARGET_LOCAL_NED.type_mask
 _LOCAL_FRAME = mavlink.MAV_FRAME_LOCAL_NED
 _V1, _V2 = mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2
@@ -57,6 +60,7 @@ class _Told:
     """What one system has told; times in s: of reception, or since it was switched on with the number of the start."""
 
     clock: list[tuple[float, float]] = field(default_factory=list)  # reception, its own
+    latest: float = -math.inf  # of its own times since it was switched on
     starts: list[int] = field(default_factory=list)  # rows of clock at which it was switched on anew
     local: list[tuple[float, ...]] = field(default_factory=list)  # row of clock, position and velocity NED
     globe: list[tuple[float, ...]] = field(default_factory=list)  # row, latitude, longitude, altitude, velocity NED
@@ -198,8 +202,11 @@ def _hear(
 def _tick(told: _Told, when: float, boot_ms: int) -> float:
     """Note both clocks; the row that they are noted in."""
     own = boot_ms * 1e-3
-    if not told.clock or own < told.clock[-1][1] - _RESTART_S:
+    since = told.latest - own
+    if not told.clock or since > _RESTART_S or (since > _BACK_S and own < _YOUNG_S):
         told.starts.append(len(told.clock))
+        told.latest = own
+    told.latest = max(told.latest, own)
     told.clock.append((when, own))
     return float(len(told.clock) - 1)
 
@@ -274,17 +281,31 @@ def _collected(told: _Told, commanded: list[tuple[float, ...]], notes: list[str]
     clock = _rows([*told.clock], 2)
     own = np.zeros(len(clock))
     for a, b in pairwise([*told.starts, len(clock)]):
-        own[a:b] = clock[a:b, 1] + np.median(clock[a:b, 0] - clock[a:b, 1])
+        # what came over a second, slower link was told before
+        first = clock[a:b, 1] >= np.maximum.accumulate(clock[a:b, 1])
+        own[a:b] = clock[a:b, 1] + np.median((clock[a:b, 0] - clock[a:b, 1])[first])
     if len(told.starts) > 1:
         notes.append(f"the vehicle was switched on {len(told.starts)} times")
 
     def at(rows: Floats) -> Floats:
         return own[rows[:, 0].astype(int)] if len(rows) else np.zeros(0)
 
-    local, globe = _rows(told.local, 7), _rows(told.globe, 7)
+    def once(rows: Floats) -> Floats:
+        """Finite positions, each once: the vehicle's clock goes on from one to the next within a start."""
+        rows = rows[np.isfinite(rows[:, 1:4]).all(axis=1)]
+        start = np.searchsorted(told.starts, rows[:, 0], "right")
+        order = np.lexsort((rows[:, 0], clock[rows[:, 0].astype(int), 1], start)) if len(rows) else np.zeros(0, int)
+        rows = rows[order]
+        times, start = clock[rows[:, 0].astype(int), 1], start[order]
+        new = np.r_[True, (np.diff(times) > 0.0) | (np.diff(start) > 0)][: len(rows)]
+        return rows[new]
+
+    local, globe = once(_rows(told.local, 7)), once(_rows(told.globe, 7))
     origin = told.origin or _derived_origin(at(local), local, at(globe), globe)
-    if not len(local) and len(globe):
-        notes.append("there are no local positions: global ones are taken")
+    rare = len(local) < 2 or float(np.median(np.diff(at(local)))) > _SPARSE_S
+    if len(globe) and rare and len(globe) > _DENSE * len(local):
+        few = "there are no local positions" if not len(local) else "local positions are rare"
+        notes.append(f"{few}: global ones are taken")
         origin = origin or Geodetic(*(float(v) for v in globe[0, 1:4]))
         position = ned_of_enu(enu_of_places(globe[:, 1:4], origin))
         local = np.concatenate([globe[:, :1], position, globe[:, 4:]], axis=1)
@@ -307,13 +328,18 @@ def _collected(told: _Told, commanded: list[tuple[float, ...]], notes: list[str]
 
 
 def _derived_origin(local_s: Floats, local: Floats, globe_s: Floats, globe: Floats) -> Geodetic | None:
-    """The origin of the local frame, from a global position at about the time of a local one."""
+    """The origin of the local frame, from global positions and what lies between the local ones about each."""
     if not len(local) or not len(globe):
         return None
-    pairs = np.searchsorted(local_s, globe_s).clip(0, len(local_s) - 1)
-    apart = np.abs(local_s[pairs] - globe_s)
-    best = int(np.argmin(apart))
-    if apart[best] > 0.5:
+    after = np.searchsorted(local_s, globe_s).clip(0, len(local_s) - 1)
+    before = np.maximum(after - (local_s[after] > globe_s), 0)
+    near = np.maximum(np.abs(local_s[after] - globe_s), np.abs(local_s[before] - globe_s)) <= _PAIR_S
+    if not near.any():
         return None
-    place = Geodetic(*(float(v) for v in globe[best, 1:4]))
-    return geodetic_of_enu(-ned_of_enu(local[pairs[best], 1:4]), place)
+    apart = np.maximum(local_s[after] - local_s[before], 1e-9)
+    share = np.clip((globe_s - local_s[before]) / apart, 0.0, 1.0)[:, None]
+    there = (1.0 - share) * local[before, 1:4] + share * local[after, 1:4]
+    place = Geodetic(*(float(v) for v in globe[near][0, 1:4]))
+    # of all of them, since each is rounded to a centimetre and a millisecond
+    offset = np.median(enu_of_places(globe[near, 1:4], place) - enu_of_ned(there[near]), axis=0)
+    return geodetic_of_enu(offset, place)
