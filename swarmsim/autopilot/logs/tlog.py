@@ -3,7 +3,8 @@
 A log holds what several systems said, each with several components: gimbals and companion computers tell attitudes by
 clocks of their own. Positions and attitudes are put on the vehicle's own clock
 (``time_boot_ms``), which radio links do not delay: their offset from the times of reception is taken as its median
-since the vehicle was switched on.
+since the vehicle was switched on. What is told without a time is put there by the median offset around its reception,
+which a simulator that does not keep the pace changes.
 """
 
 import math
@@ -39,6 +40,7 @@ _EPOCHS_US = (631_152_000_000_000, 4_102_444_800_000_000)  # 1990 to 2100: anoth
 _RESTART_S, _YOUNG_S = 30.0, 10.0  # a clock so far back, or back and so young, began anew; else it is an old message
 _BACK_S = 1.0
 _DENSE, _SPARSE_S = 1.5, 0.4  # global positions are taken where they are so many times as many, and local ones so rare
+_AROUND_S = 5.0  # before and after a reception, of which the offset between the clocks is the median
 _PAIR_S = 1.1  # longest time between two local positions about a global one
 _POSITION_IGNORED = 0x7  # of SET_POSITION_TARGET_LOCAL_NED.type_mask
 _LOCAL_FRAME = mavlink.MAV_FRAME_LOCAL_NED
@@ -313,18 +315,36 @@ def _collected(told: _Told, commanded: list[tuple[float, ...]], notes: list[str]
     if not len(quaternions) and len(euler):
         quaternions = np.concatenate([euler[:, :1], quaternion_of_euler(euler[:, 1:])], axis=1)
     battery, sent = _rows([*told.battery], 2), _rows(commanded, 4)
+    drift = _drift(clock, own)
+
+    def heard(rows: list[tuple[float, Any]]) -> list[tuple[float, Any]]:
+        return list(zip(drift(np.array([when for when, _ in rows])).tolist(), (what for _, what in rows), strict=True))
+
     return Collected(
         time_s=at(local),
         position_ned_m=local[:, 1:4],
         velocity_ned_m_s=local[:, 4:],
         attitude=Series(at(quaternions), quaternions[:, 1:]) if len(quaternions) else empty(4),
-        modes=told.modes,
-        armed=told.armed,
-        messages=told.messages,
-        battery=Series(battery[:, 0], battery[:, 1]),
-        setpoints_ned_m=Series(sent[:, 0], sent[:, 1:]),
+        modes=heard(told.modes),
+        armed=heard(told.armed),
+        messages=heard(told.messages),
+        battery=Series(drift(battery[:, 0]), battery[:, 1]),
+        setpoints_ned_m=Series(drift(sent[:, 0]), sent[:, 1:]),
         origin=origin,
     )
+
+
+def _drift(clock: Floats, own: Floats) -> Callable[[Floats], Floats]:
+    """From times of reception to the vehicle's clock: ``own`` [n] are times on it of rows (reception, told) [n, 2]."""
+    if not len(clock):
+        return lambda when: when
+    order = np.argsort(clock[:, 0], kind="stable")
+    heard, late = clock[order, 0], (clock[:, 0] - own)[order]
+    knots = np.arange(heard[0], heard[-1] + _AROUND_S, _AROUND_S)
+    parts = np.searchsorted(heard, np.stack([knots - _AROUND_S, knots + _AROUND_S]))
+    known = parts[1] > parts[0]
+    medians = [float(np.median(late[a:b])) for a, b in parts.T[known]]
+    return lambda when: when - np.interp(when, knots[known], medians)
 
 
 def _derived_origin(local_s: Floats, local: Floats, globe_s: Floats, globe: Floats) -> Geodetic | None:

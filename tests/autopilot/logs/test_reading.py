@@ -384,3 +384,18 @@ def test_of_rare_local_and_frequent_global_positions_the_latter_are_taken(tmp_pa
     assert len(found.time_s) == len(TRUTH.time_s)
     assert any("local positions are rare" in note for note in found.notes)
     np.testing.assert_allclose(found.position_m, TRUTH.position_m, atol=0.03)
+
+
+def test_words_are_put_on_the_clock_of_a_simulator_that_falls_behind(tmp_path):
+    """For 40 s it makes half of the pace: the modes are told at twice the vehicle's own times, then 20 s late."""
+    truth = writers.flight()
+    log = writers.Tlog()
+    for k, t in enumerate(truth.time_s):
+        when = 2.0 * min(t, 20.0) + max(t - 20.0, 0.0)
+        mode = 6 << 16 if 10.0 <= t < 25.0 else 4 << 16 | 3 << 24
+        log.put(when, mavlink.MAVLink_heartbeat_message(2, 12, 1 | 128, mode, 4, 3))
+        log.put(when, mavlink.MAVLink_local_position_ned_message(
+            round((t + 50.0) * 1e3), *ned_of_enu(truth.position_m[k]), *ned_of_enu(truth.velocity_m_s[k])))  # fmt: skip
+    found = read(tmp_path, "tlog", bytes(log.data))
+    assert found.spans_s() == [pytest.approx((10.0, 25.0), abs=0.6)]
+    np.testing.assert_allclose(found.position_m, truth.position_m, atol=1e-5)
