@@ -21,9 +21,11 @@ os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 _CACHE = Path(os.environ.get("SWARMSIM_TEST_CACHE", Path(tempfile.gettempdir()) / "swarmsim-test-cache"))
 os.environ.setdefault("SWARMSIM_CACHE_DIR", str(_CACHE))
 
-# A shell without job control has its background jobs ignore Ctrl-C, and so would the programs that tests start.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# Background jobs of a shell without job control ignore Ctrl-C, those of nohup a closed terminal; and so would the
+# programs that tests start.
+for _number, _default in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _default)
 
 # the environment is set first
 import jax  # noqa: E402

@@ -120,7 +120,10 @@ entry.main()
         assert running.stdout is not None
         ready = running.stdout.readline()
         running.send_signal(sent)
-        _, error = running.communicate(timeout=60)
+        try:
+            _, error = running.communicate(timeout=60)
+        finally:
+            running.kill()
     assert ready == "ready\n", error
     assert running.returncode == code
     assert told in error
