@@ -7,13 +7,16 @@ import io
 import os
 import signal
 import sys
+import threading
 from collections.abc import Sequence
+from typing import Any
 
 from cyclopts import CycloptsError
 
 from swarmsim.cli.commands import app
 from swarmsim.config.errors import InputError
 
+_AGAIN_S = 0.05
 EXIT_INPUT, EXIT_HUNG_UP, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 129, 130, 143
 
 
@@ -38,6 +41,26 @@ def _handle_signals() -> None:
     hang_up = getattr(signal, "SIGHUP", None)  # Windows has none
     if hang_up is not None and signal.getsignal(hang_up) is signal.SIG_DFL:  # nohup has it ignored
         signal.signal(hang_up, _hang_up)
+    sys.unraisablehook = _unraisable
+
+
+def _unraisable(found: Any) -> None:
+    """Ctrl-C that met a finaliser or a callback, which swallow it, comes again when these have ended."""
+    if not isinstance(found.exc_value, KeyboardInterrupt):
+        sys.__unraisablehook__(found)
+        return
+    number = {Terminated: signal.SIGTERM, HungUp: getattr(signal, "SIGHUP", signal.SIGTERM)}.get(
+        type(found.exc_value), signal.SIGINT
+    )
+    again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
+    again.daemon = True
+    again.start()
+
+
+def _stop_of(error: BaseException) -> KeyboardInterrupt | None:
+    """The Ctrl-C that an error stands for: Python 3.11 wraps one that meets a class being made."""
+    stop = error if isinstance(error, KeyboardInterrupt) else error.__cause__
+    return stop if isinstance(stop, KeyboardInterrupt) else None
 
 
 def _told(text: str) -> None:
@@ -77,7 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INPUT
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except KeyboardInterrupt as stop:
+    except (KeyboardInterrupt, RuntimeError) as error:
+        stop = _stop_of(error)
+        if stop is None:
+            raise
         code, by = EXIT_INTERRUPTED, "with Ctrl-C"
         if isinstance(stop, Terminated):
             code, by = EXIT_TERMINATED, "by SIGTERM"

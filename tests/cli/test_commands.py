@@ -92,6 +92,29 @@ def test_the_help_is_quick_and_says_what_there_is() -> None:
     assert took < 5.0  # 0.15 s on a quiet machine; an import of jax alone costs more than this under load
 
 
+@pytest.mark.parametrize("where", ["__del__", "__set_name__"])
+def test_ctrl_c_is_heard_where_python_swallows_or_wraps_it(where: str) -> None:
+    script = f"""
+import os, signal, sys, time
+from swarmsim.cli import entry
+class Meets:
+    def {where}(self, *of):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.2)
+def command(*arguments, **options):
+    made = Meets()
+    if {where!r} == "__set_name__":
+        type("Owner", (), dict(made=made))
+    del made
+    time.sleep(600)
+entry.app = command
+entry.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 130
+    assert ended.stderr.strip() == "stopped with Ctrl-C: nothing unfinished was left behind"
+
+
 @pytest.mark.parametrize(
     ("sent", "code", "told"),
     [
