@@ -24,13 +24,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
 
-from swarmsim.autopilot.along_track import distance_from, matched
+from swarmsim.autopilot.along_track import distance_from, matched, nearest
 
 Floats = NDArray[np.float64]
 ON_LINE_SHARE = 0.7  # of the greatest speed: slower parts are corners, take-off and landing
 STEP_S = 0.05  # of the times at which tracks are compared
-GAP_S, GAP_PERIODS = 1.0, 2.5  # between positions farther apart, and so many times as usual, nothing is assumed
-GAP_MOST_S = 3.0
+GAP_S, GAP_PERIODS, GAP_MOST_S = 1.0, 2.5, 3.0  # see `Track.gap_s`
 CAP_M = 5.0  # what is farther apart fits no better or worse: several times what lags and estimates make
 CORNER_M = 0.5  # a path that bends by less is one leg
 LEG_M = 2.0  # shorter ones are corners
@@ -40,8 +39,6 @@ _SPEED_OVER_S = 1.0
 _MOVING_SHARE, _STANDING = 0.2, 0.1  # of the greatest speed: slower is standing, which counts so much in a shift
 _COMMON_SHARE = 0.2  # of the shorter flight, for which both move at the same time at least
 _TIE_M = 0.5  # a shift over the whole search must make an rms better by as much as this
-_CHUNK = 256
-_HEIGHT_WEIGHT = 0.01  # of squared differences in height: 5 m count as half a metre aside
 
 
 @dataclass(frozen=True)
@@ -220,35 +217,6 @@ def on_lines(speed_m_s: Floats) -> NDArray[np.bool_]:
     known = np.isfinite(speed_m_s)
     top = float(np.max(speed_m_s[known])) if known.any() else 0.0
     return np.asarray(known & (speed_m_s > ON_LINE_SHARE * top))
-
-
-def nearest(places_m: ArrayLike, path_m: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Of places the horizontal distance [n] from a polyline [P, 3], and its height and arc length there [n].
-
-    With places [n, 3] their heights tell apart the parts of a path that lie over each other, as where it climbs
-    upright or crosses itself; [n, 2] does without.
-    """
-    places, path = np.asarray(places_m, np.float64), np.asarray(path_m, np.float64)
-    if len(path) == 1:
-        path = np.concatenate([path, path])
-    start, step = path[:-1], np.diff(path, axis=0)
-    length2 = np.sum(step[:, :2] ** 2, axis=1)
-    along = np.r_[0.0, np.cumsum(np.sqrt(length2))]
-    distance, height, arc = (np.full(len(places), np.nan) for _ in range(3))
-    for first in range(0, len(places), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        offset = places[part, None, :2] - start[:, :2]
-        share = np.clip(np.sum(offset * step[:, :2], axis=2) / np.maximum(length2, 1e-12), 0.0, 1.0)
-        apart = np.sum((offset - share[..., None] * step[:, :2]) ** 2, axis=2)
-        cost = apart
-        if places.shape[1] > 2:
-            cost = apart + _HEIGHT_WEIGHT * (places[part, None, 2] - start[:, 2] - share * step[:, 2]) ** 2
-        best = np.argmin(cost, axis=1)
-        row = np.arange(len(best))
-        distance[part] = np.sqrt(apart[row, best])
-        height[part] = start[best, 2] + share[row, best] * step[best, 2]
-        arc[part] = along[best] + share[row, best] * (along[best + 1] - along[best])
-    return distance, height, arc
 
 
 def _from_paths(

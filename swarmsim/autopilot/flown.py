@@ -11,7 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from swarmsim.autopilot.compare import nearest, on_lines
+from swarmsim.autopilot.along_track import nearest
+from swarmsim.autopilot.compare import on_lines
 from swarmsim.autopilot.link import Identity, Setpoint, Telemetry
 from swarmsim.results.names import FLIGHT, FLOWN
 

@@ -16,7 +16,7 @@ from cyclopts import CycloptsError
 from swarmsim.cli.commands import app
 from swarmsim.config.errors import InputError
 
-_AGAIN_S = 0.05
+_AGAIN_S = 0.05  # after which what swallowed Ctrl-C has ended
 EXIT_INPUT, EXIT_HUNG_UP, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 129, 130, 143
 
 

@@ -119,6 +119,15 @@ def _flown_vehicle(run: Path) -> str | None:
         raise InputError.of("is damaged", file=run / FLIGHT, suggestion="name the vehicle with --vehicle") from error
 
 
+def _flew(run: Path, vehicle: str, console: Console) -> bool:
+    """Whether the run tells that it is this vehicle's; where it cannot tell, a note, and the mission is flown anew."""
+    try:
+        return vehicle == _flown_vehicle(run)
+    except InputError:
+        console.print(f"note: {FLIGHT} of the run is damaged: the mission is simulated anew", highlight=False)
+        return False
+
+
 def _mission(
     name: str, vehicle: str, seed: int | None, overrides: Sequence[str], run: Path | None, console: Console
 ) -> _Mission:
@@ -135,8 +144,7 @@ def _mission(
         )
     use_all_cores()
     simulation = build(scenario)
-    as_flown = run is not None and has_simulated(run) and not overrides and seed is None
-    if run is not None and as_flown and vehicle == _flown_vehicle(run):
+    if run is not None and not overrides and seed is None and has_simulated(run) and _flew(run, vehicle, console):
         simulated, planned = read_simulated(run)
     else:
         with console.status("fly the mission in simulation"):

@@ -69,7 +69,7 @@ class Firmware:
     """The firmware of one vehicle as a process, its output in ``folder``/firmware.log."""
 
     def __init__(self, command: str, autopilot: str, seat: Seat, vehicle: Multirotor | SkidSteer, folder: Path):
-        """Start it; raises `InputError` for a command with a placeholder that there is none of."""
+        """Start it; raises `InputError` for a command with an unknown name in braces."""
         self.name, self.folder = seat.name, folder
         folder.mkdir(parents=True, exist_ok=True)
         parameters = parameters_of(autopilot, vehicle)
@@ -88,7 +88,7 @@ class Firmware:
             line = command.format(**known)
         except (KeyError, IndexError, ValueError) as error:
             raise InputError.of(
-                "the start command has a placeholder that there is none of", path="--start", given=str(error),
+                "the start command has an unknown name in braces", path="--start", given=str(error),
                 allowed=PLACEHOLDERS + "; other braces are written twice",
             ) from error  # fmt: skip
         named = {f"PX4_PARAM_{name}": f"{value:g}" for name, value in parameters.items()} if autopilot == "px4" else {}

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmsim.autopilot.along_track import distance_from, matched
-from swarmsim.autopilot.compare import Planned, Simulated, Track, compare, nearest, time_shift_s
+from swarmsim.autopilot.along_track import distance_from, matched, nearest
+from swarmsim.autopilot.compare import Planned, Simulated, Track, compare, time_shift_s
 
 LINES = np.array([[0.0, 0, 10], [40, 0, 10], [40, 200, 10], [80, 200, 10]])  # three phases at right angles
 PATHS = tuple(Planned(name, LINES[k : k + 2]) for k, name in enumerate("abc"))

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from swarmsim.autopilot.along_track import nearest
 from swarmsim.autopilot.compare import (
     Planned,
     Simulated,
     Track,
     compare,
     leg_ends_m,
-    nearest,
     on_lines,
     statistics,
     time_shift_s,

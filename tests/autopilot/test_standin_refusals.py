@@ -20,8 +20,8 @@ def told(bench: Bench) -> str:
     return " | ".join(message.text for message in bench.all("STATUSTEXT"))
 
 
-def fenced(**fields) -> Bench:
-    bench = ardupilot_flying() if fields.get("flies", True) else Bench("ardupilot", flies=False).advance(6.0)
+def fenced(*, flies: bool = True) -> Bench:
+    bench = ardupilot_flying() if flies else Bench("ardupilot", flies=False).advance(6.0)
     bench.standin.pilot.parameters.put("FENCE_ENABLE", 1)
     bench.standin.pilot.parameters.put("FENCE_RADIUS", 20.0)
     return bench

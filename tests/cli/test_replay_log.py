@@ -143,6 +143,19 @@ def test_a_damaged_report_of_the_run_is_told(content, run, capsys):
     assert "--vehicle" in capsys.readouterr().err
 
 
+def test_with_the_vehicle_named_a_damaged_report_is_told_and_the_mission_simulated(run, tmp_path, capsys, monkeypatch):
+    from swarmsim.autopilot import simulated_track
+
+    whole = simulated_track.read_simulated(run)
+    monkeypatch.setattr(simulated_track, "simulate_vehicle", lambda simulation, vehicle: whole)
+    monkeypatch.setattr(simulated_track, "read_simulated", lambda folder: pytest.fail("whose it is, is not known"))
+    (run / "flown.json").write_text("{", encoding="utf-8")
+    assert main(["replay-log", "flight.tlog", "--run", str(run), "--vehicle", "uav", "--out", "out"]) == 0
+    assert "flown.json of the run is damaged" in capsys.readouterr().out
+    made = json.loads((tmp_path / "out" / "log.json").read_text(encoding="utf-8"))["comparison"]
+    assert made["time_shift_s"] == pytest.approx(writers.ARMED_S, abs=0.05)
+
+
 def test_a_log_without_a_place_on_the_earth(tmp_path, capsys):
     data = writers.tlog(TRUTH)
     first = 8 + 12 + data[9]

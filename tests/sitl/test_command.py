@@ -118,7 +118,7 @@ def state_of(process):
         return "Z"
 
 
-def test_a_placeholder_that_there_is_none_of(folder):
+def test_an_unknown_name_in_braces_is_told(folder):
     with pytest.raises(InputError, match="instance"):
         started("px4 {number}", folder)
     with pytest.raises(InputError, match="twice"):

@@ -293,14 +293,9 @@ def _collected(told: _Told, commanded: list[tuple[float, ...]], notes: list[str]
         return own[rows[:, 0].astype(int)] if len(rows) else np.zeros(0)
 
     def once(rows: Floats) -> Floats:
-        """Finite positions, each once: the vehicle's clock goes on from one to the next within a start."""
+        """Finite positions in the order of the vehicle's clock, each once, whichever link told it first."""
         rows = rows[np.isfinite(rows[:, 1:4]).all(axis=1)]
-        start = np.searchsorted(told.starts, rows[:, 0], "right")
-        order = np.lexsort((rows[:, 0], clock[rows[:, 0].astype(int), 1], start)) if len(rows) else np.zeros(0, int)
-        rows = rows[order]
-        times, start = clock[rows[:, 0].astype(int), 1], start[order]
-        new = np.r_[True, (np.diff(times) > 0.0) | (np.diff(start) > 0)][: len(rows)]
-        return rows[new]
+        return rows[np.unique(at(rows), return_index=True)[1]]
 
     local, globe = once(_rows(told.local, 7)), once(_rows(told.globe, 7))
     origin = told.origin or _derived_origin(at(local), local, at(globe), globe)
