@@ -135,11 +135,15 @@ def test_a_companion_computer_of_the_same_system_is_heard(autopilot):
     assert bench.command(*request, system=1, component=1) == []  # its own words
 
 
-def test_ardupilot_acknowledges_the_message_that_sets_a_mode():
-    bench = Bench("ardupilot").advance(6.0)
-    bench.standin.deliver(mav.MAVLink_set_mode_message(1, 1, GUIDED))
-    answer = bench.last("COMMAND_ACK")
-    assert (answer.command, answer.result) == (mav.MAVLINK_MSG_ID_SET_MODE, 0)
+@pytest.mark.parametrize(
+    ("autopilot", "mode", "told_as"), [("ardupilot", GUIDED, 11), ("px4", POSCTL, mav.MAV_CMD_DO_SET_MODE)]
+)
+def test_the_message_that_sets_a_mode_is_acknowledged_once(autopilot, mode, told_as):
+    """PX4 1.17 was seen to answer so, ArduPilot's code does."""
+    bench = Bench(autopilot).advance(6.0)
+    bench.standin.deliver(mav.MAVLink_set_mode_message(1, 1, mode))
+    assert [(answer.command, answer.result) for answer in bench.all("COMMAND_ACK")] == [(told_as, 0)]
+    assert bench.advance(1.1).custom_mode == mode
 
 
 def test_intervals_of_what_is_not_and_of_what_never_comes():

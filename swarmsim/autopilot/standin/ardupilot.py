@@ -41,6 +41,7 @@ class ArduPilot(Autopilot):
 
     type_number = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     bit_patterns = False
+    set_mode_told_as = mav.MAVLINK_MSG_ID_SET_MODE
     refused = FAILED
 
     def __init__(self, *arguments: Any, **fields: Any):

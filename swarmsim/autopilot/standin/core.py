@@ -61,6 +61,7 @@ class Autopilot(ABC):
     type_number: int  # MAV_AUTOPILOT
     bit_patterns: bool  # integer parameters travel as the bits of a float
     manual_mode: str  # the mode of the operator that it boots in
+    set_mode_told_as: int  # the command that the message SET_MODE is acknowledged as
     refused: int  # result of a command that cannot be carried out now
 
     def __init__(self, settings: Settings, sensed: Sensed, flies: bool, system: int = 1):

@@ -30,6 +30,7 @@ class PX4(Autopilot):
     type_number = mav.MAV_AUTOPILOT_PX4
     bit_patterns = True
     manual_mode = "MANUAL"
+    set_mode_told_as = mav.MAV_CMD_DO_SET_MODE
     refused = REJECTED
 
     def __init__(self, *arguments: Any, **fields: Any):

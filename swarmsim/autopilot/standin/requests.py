@@ -114,9 +114,8 @@ class Requests:
     def _set_mode(self, message: Any) -> None:
         if message.base_mode & mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
             results = self._pilot.set_mode(self._mode_named(message.custom_mode))
-            if self._pilot.type_number == mav.MAV_AUTOPILOT_ARDUPILOTMEGA:
-                whom = message.get_srcSystem(), message.get_srcComponent()
-                self._pilot.send(mav.MAVLink_command_ack_message(message.get_msgId(), results[-1], 0, 0, *whom))
+            whom = message.get_srcSystem(), message.get_srcComponent()
+            self._pilot.send(mav.MAVLink_command_ack_message(self._pilot.set_mode_told_as, results[-1], 0, 0, *whom))
 
     def _mode_named(self, number: int) -> str | None:
         return next((name for name, known in self._pilot.modes.items() if known == number), None)
