@@ -80,8 +80,7 @@ def above_of(site: Site) -> Ceilings:
 
 def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes | None" = None) -> Crossed:
     direction = b - a
-    squared = jnp.sum(direction * direction)
-    distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
+    distance = _length(direction)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
     found = (boxes or _all_boxes)(site, a, direction, distance)
     fractions, moments, thin = found.share, found.moment, found.thin
@@ -101,6 +100,12 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Bo
     place, spread, closed = jax.lax.stop_gradient((jnp.clip(place, 0.0, 1.0), spread, closed))
     shape = Shape(thin_m=distance * thin, spread=spread, closed=closed, ground=mirrored(site, a, b))
     return Crossed(length_m=distance * fractions, place=place, shape=shape)
+
+
+def _length(vector: jax.Array) -> jax.Array:
+    """Length [...] of vectors [..., 3]; that of zero has no derivative, not one that is no number."""
+    squared = jnp.sum(vector * vector, axis=-1)
+    return jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
 
 
 def mirrored(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
@@ -126,32 +131,81 @@ def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
 def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     """In blocks of neighbouring ends; clusters of boxes that none of a block's segments comes near are left out.
 
-    Within a cluster the boxes are the vectorised axis.
+    Of the boxes of a cluster, those that a segment meets are taken one after another, for all segments of the block at
+    once: few segments meet more than one or two.
     """
     n, above, clusters = b.shape[0], above_of(site), _clusters(site.obstacles)
     size = min(NEIGHBOURS, n)
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
+    row, one = jnp.zeros((size, len(site.material_names))), jnp.zeros(size)
+    nothing = _Found(share=row, moment=row, thin=row, narrow=one, closed=one)
 
     def block(ends: jax.Array) -> Crossed:
         near = jax.lax.map(lambda boxes: jnp.any(_near(boxes, a, ends)), clusters)
+        direction = ends - a
+        distance = _length(direction)
 
-        def of_clusters(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
-            def add(found: _Found, cluster: tuple[Obstacles, jax.Array]) -> tuple[_Found, None]:
-                def met(found: _Found) -> _Found:
-                    own = _all_boxes(replace(site, obstacles=cluster[0]), a, direction, distance)
-                    own = replace(own, narrow=jnp.sum(own.narrow), closed=jnp.sum(own.closed))
-                    return jax.tree.map(jnp.add, found, own)
+        def add(found: _Found, cluster: tuple[Obstacles, jax.Array]) -> tuple[_Found, None]:
+            def met(found: _Found) -> _Found:
+                return _met(site, cluster[0], a, direction, distance, found)
 
-                return jax.lax.cond(cluster[1], met, lambda found: found, found), None
+            return jax.lax.cond(cluster[1], met, lambda found: found, found), None
 
-            zero, one = jnp.zeros(len(site.material_names)), jnp.zeros(())
-            nothing = _Found(share=zero, moment=zero, thin=zero, narrow=one, closed=one)
+        def some() -> _Found:
             return jax.lax.scan(add, nothing, (clusters, near))[0]
 
-        return jax.vmap(lambda end: _crossed(site, above, a, end, of_clusters))(ends)
+        found = jax.lax.cond(jnp.any(near), some, lambda: nothing)
+        return jax.vmap(lambda end, own: _crossed(site, above, a, end, lambda *_: own))(ends, found)
 
     found = jax.lax.map(block, ends)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
+
+
+def _met(
+    site: Site, boxes: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array, found: "_Found"
+) -> "_Found":
+    """``found`` [n] with what n segments from ``a`` [3] cross of some boxes."""
+    materials, numbers = jnp.arange(len(site.material_names), dtype=jnp.int32), jnp.arange(boxes.wall_m.shape[0])
+
+    def more(carry: tuple[jax.Array, _Found]) -> jax.Array:
+        return jnp.any(carry[0])
+
+    def next_(carry: tuple[jax.Array, _Found]) -> tuple[jax.Array, _Found]:
+        meets, found = carry
+        number = jnp.argmax(meets, axis=1)
+
+        def one(number: jax.Array, meets: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
+            box = jax.tree.map(lambda x: x[number][None], boxes)
+            own = jax.tree.map(lambda x: jnp.where(meets, x[0], 0.0), _of_boxes(box, a, direction, distance))
+            return _by_material(own, box.material[0] == materials)
+
+        own = jax.vmap(one)(number, jnp.any(meets, axis=1), direction, distance)
+        return meets & (numbers != number[:, None]), jax.tree.map(jnp.add, found, own)
+
+    meets = jax.vmap(lambda d: _meets(boxes, a, d))(direction)
+    return jax.lax.while_loop(more, next_, (meets, found))[1]
+
+
+def _by_material(found: "_Found", material: jax.Array) -> "_Found":
+    """What was found of one box [], or of each [1], by ``material`` [M]: whether it is the box's."""
+    share, moment, thin = (jnp.where(material, x, 0.0) for x in (found.share, found.moment, found.thin))
+    return _Found(share=share, moment=moment, thin=thin, narrow=found.narrow, closed=found.closed)
+
+
+def _meets(boxes: Obstacles, a: jax.Array, direction: jax.Array) -> jax.Array:
+    """Whether a segment meets each box [K]: those that `_of_boxes` finds something of."""
+    middle, reach = _slabs(boxes, a, direction)
+    (enter, leave), _ = _slab_fraction(middle, reach, [boxes.half_extent_m[:, k] for k in range(3)])
+    # what is no number stays so
+    return ~(jnp.minimum(_least(leave), 1.0) <= jnp.maximum(_most(enter), 0.0))
+
+
+def _slabs(boxes: Obstacles, a: jax.Array, direction: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Where [K] a line from ``a`` crosses the middle planes of boxes, and how much of it a metre across them takes."""
+    start, along = _in_axes(boxes, a - boxes.centre_m), _in_axes(boxes, direction)
+    # Clamp a component that is too small to divide by: the slab then extends far beyond the segment.
+    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
+    return [-x * i for x, i in zip(start, inverse, strict=True)], [jnp.abs(i) for i in inverse]
 
 
 def _clusters(boxes: Obstacles) -> Obstacles:
@@ -213,13 +267,16 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
     nothing, shapes = np.zeros(1, np.float32), above.shapes
     bare = jax.tree.map(lambda _: nothing, site)
 
-    def one(end: jax.Array, start: jax.Array, needed: Any, highest: jax.Array) -> Crossed:
+    def one(end: jax.Array, start: jax.Array, needed: Any, heights: tuple[jax.Array, jax.Array]) -> Crossed:
         boxes, terrain, origin, cell, ground = needed
         here = replace(bare, obstacles=boxes, terrain_m=terrain, origin_m=origin, cell_m=cell, ground_material=ground)
-        return _crossed(here, Ceilings(highest_m=highest, shapes=shapes), start, end, _box_after_box)
+        ceiling = Ceilings(highest_m=heights[0], around_m=heights[1], shapes=shapes)
+        return _crossed(here, ceiling, start, end, _box_after_box)
 
     starts = jnp.broadcast_to(a, b.shape)
-    found: Crossed = over_vehicles(one, (0, 0, None, None), platform=platform)(b, starts, needed, above.highest_m)
+    found: Crossed = over_vehicles(one, (0, 0, None, None), platform=platform)(
+        b, starts, needed, (above.highest_m, above.around_m)
+    )
     return found
 
 
@@ -253,11 +310,8 @@ def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax
 
     def add(k: jax.Array, found: _Found) -> _Found:
         box = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 1), boxes)
-        met = _of_boxes(box, a, direction, distance)
-        own = box.material == materials
-        share, moment, thin = (jnp.where(own, x, 0.0) for x in (met.share, met.moment, met.thin))
-        each = _Found(share=share, moment=moment, thin=thin, narrow=met.narrow, closed=met.closed)
-        return jax.tree.map(jnp.add, found, each)
+        own = _by_material(_of_boxes(box, a, direction, distance), box.material == materials)
+        return jax.tree.map(jnp.add, found, own)
 
     zero, one = jnp.zeros(materials.shape), jnp.zeros(1)
     nothing = _Found(share=zero, moment=zero, thin=zero, narrow=one, closed=one)
@@ -267,10 +321,7 @@ def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax
 def _of_boxes(obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
     """What the segment crosses of each box [K]. Written per component, so that the boxes are the vectorised axis."""
     start, along = _in_axes(obstacles, a - obstacles.centre_m), _in_axes(obstacles, direction)
-    # Clamp a component that is too small to divide by: the slab then extends far beyond the segment.
-    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
-    middle = [-x * i for x, i in zip(start, inverse, strict=True)]
-    reach = [jnp.abs(i) for i in inverse]
+    middle, reach = _slabs(obstacles, a, direction)
     outer = [obstacles.half_extent_m[:, k] for k in range(3)]
     inner = [half - obstacles.wall_m for half in outer]
     hollow = (obstacles.wall_m > 0.0) & (_least(inner) > 0.0)

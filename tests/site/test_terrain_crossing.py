@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from swarmsim.site import crossed, path_lengths, sample
 from swarmsim.site.rays import crossed_from
-from swarmsim.site.terrain_crossing import ceilings, share_below
+from swarmsim.site.terrain_crossing import ceilings, clear_until, share_below
 from tests.site.yards import MATERIALS, make_site
 
 HALF = 40.0
@@ -66,6 +66,26 @@ def test_it_is_what_dense_sampling_finds(seed):
     np.testing.assert_allclose(share, expected, atol=6e-4)
     seen = np.asarray(expected) > 0.02
     np.testing.assert_allclose(np.asarray(place)[seen], np.asarray(mean)[seen], atol=5e-3)
+
+
+@jax.jit
+def _clear(site, a, b):
+    return jax.vmap(lambda a, b: clear_until(site, ceilings(site.terrain_m), a, b))(a, b)
+
+
+def test_what_counts_as_clear_is_above_the_ground():
+    """A thousand segments, many of them just above the ground: none is below it before the share told."""
+    for seed in range(4):
+        site, a, b = hills(seed), ends(seed + 10, 250), ends(seed + 20, 250)
+        heights = np.random.default_rng(seed).uniform(0.05, 2.0, (2, 250))
+        on = jax.vmap(lambda x: sample(site.terrain_m, site, x))
+        a, b = (x.at[:, 2].set(on(x[:, :2]) + h) for x, h in zip((a, b), heights, strict=True))
+        until = _clear(site, a, b)
+        below, _ = _sampled(site, a, a + until[:, None] * (b - a))
+        assert float(below.max()) == 0.0
+        assert 0.3 < float(jnp.mean(until >= 1.0)) < 1.0
+        share, _ = _shares(site, a, b)
+        assert float(share[until >= 1.0].max()) == 0.0
 
 
 def test_a_bank_of_a_metre_on_a_ray_of_a_hundred():
