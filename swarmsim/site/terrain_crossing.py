@@ -5,9 +5,9 @@ whose roots are where the segment enters and leaves the ground. A segment is fol
 mipmap (Tevs, Ihrke and Seidel, I3D 2008) lets it skip what lies above all ground: a ray to an aircraft takes a dozen
 steps, one along the ground one for each patch.
 
-Most segments stay above the ground. They are told by fewer and cheaper steps, whose length is not that to the border of a
-tile: the ground in the four tiles that a step can touch is looked at together (`clear_until`). Only from where that finds
-no way on is a segment followed patch by patch.
+Most segments stay above the ground. They are told by fewer and cheaper steps, whose length is not that to the border of
+a tile: the ground in the four tiles that a step can touch is looked at together (`clear_until`). Only from where that
+finds no way on is a segment followed patch by patch.
 """
 
 from functools import partial

@@ -1,5 +1,7 @@
 """The part of a segment below the terrain, against closed forms and dense sampling."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -78,7 +80,7 @@ def test_what_counts_as_clear_is_above_the_ground():
     for seed in range(4):
         site, a, b = hills(seed), ends(seed + 10, 250), ends(seed + 20, 250)
         heights = np.random.default_rng(seed).uniform(0.05, 2.0, (2, 250))
-        on = jax.vmap(lambda x: sample(site.terrain_m, site, x))
+        on = jax.vmap(partial(sample, site.terrain_m, site))
         a, b = (x.at[:, 2].set(on(x[:, :2]) + h) for x, h in zip((a, b), heights, strict=True))
         until = _clear(site, a, b)
         below, _ = _sampled(site, a, a + until[:, None] * (b - a))
