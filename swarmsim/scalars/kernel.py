@@ -16,8 +16,9 @@ import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from swarmsim.scalars.access import Memory, MemoryGraph, Numbers, Rows, apart
 from swarmsim.scalars.control import CONTROL, loop_counts
-from swarmsim.scalars.graph import Graph, Node, Scalar, is_constant, varying_axes
+from swarmsim.scalars.graph import Graph, Scalar, is_constant, varying_axes
 from swarmsim.scalars.indexing import full_start, gather_plan
 from swarmsim.scalars.interpreter import SMALL, Interpreter, Value, Whole, is_number, is_small, needed
 from swarmsim.scalars.program import Program
@@ -39,7 +40,7 @@ class _View:
     """Part of an array in memory, which is read where an index is known."""
 
     ref: Any
-    first: Callable[[Any], Any]  # index of the vehicles' first entries in the flat array, from their numbers
+    rows: Rows
     offset: Scalar  # of the part within it
     strides: tuple[int, ...]
     shape: tuple[int, ...]
@@ -49,8 +50,8 @@ class _View:
 class _InKernel(Interpreter):
     """Evaluates a program within a kernel; arrays that are not taken apart are views of memory."""
 
-    nothing: Any = None  # [] int32: zero, which the compiler does not know
-    vehicle: Any = None  # [threads] int32: number of each thread's vehicle, counted through all missions
+    graph: MemoryGraph
+    nothing: Any = None  # [] int32: zero, which no compiler knows
 
     def loop(self, step: Callable[..., Any], first: list[Any], columns: list[Any], params: Any) -> Any:
         """A loop, of a length that the compiler does not know, or it might write out all loops within one another."""
@@ -90,25 +91,11 @@ class _InKernel(Interpreter):
         if not is_small(aval, SMALL):
             return Whole(view, mapped)
         places = [_flat(view.strides, index) for index in np.ndindex(*view.shape)]
-        return pack(self.entries(view, view.offset, places, mapped), aval.shape, aval.dtype)
+        return pack(self.entries(view, view.offset, places), aval.shape, aval.dtype)
 
-    def entries(self, view: _View, offset: Scalar, places: Sequence[int], mapped: bool) -> list[Scalar]:
+    def entries(self, view: _View, offset: Scalar, places: Sequence[int]) -> list[Scalar]:
         """Entries of a view, ``places`` further than an ``offset``."""
-        if is_constant(offset):
-            return [self._argument(view, int(offset) + place, mapped) for place in places]
-        ref, first = view.ref, view.first(self.vehicle)
-        every = [
-            self.graph.node(("read", id(ref), place), lambda at, k=place: ref[first + at + np.int32(k)], (offset,))
-            for place in places
-        ]
-        for node in every:
-            node.mapped = node.mapped or mapped
-        return every
-
-    def _argument(self, view: _View, place: int, mapped: bool) -> Node:
-        """Entry of an argument at a place that is known; `_read_together` reads those that are needed."""
-        ref, first = view.ref, view.first(self.vehicle)
-        return Node(lambda: ref[first + np.int32(place)], (), mapped)
+        return [self.graph.read(view.ref, view.rows, offset, place) for place in places]
 
 
 def _scan(interpreter: _InKernel, equation: Any, values: list[Value]) -> Sequence[Value]:
@@ -128,18 +115,18 @@ def _moved(graph: Graph, view: _View, start: Sequence[Scalar]) -> Scalar:
     """Offset of the entry ``start`` of a view."""
     offset = view.offset
     for index, stride in zip(start, view.strides, strict=True):
-        offset = graph.apply(ADD, offset, graph.apply(MUL, _index(index), np.int32(stride)))
+        offset = graph.apply(ADD, offset, graph.apply(MUL, _index(graph, index), np.int32(stride)))
     return offset
 
 
-def _index(scalar: Scalar) -> Scalar:
+def _index(graph: Graph, scalar: Scalar) -> Scalar:
     if isinstance(scalar, np.generic):
         return np.int32(scalar)
-    return Node(lambda x: lax.convert_element_type(x, jnp.int32), (scalar,), scalar.mapped)
+    return graph.node("index", lambda x: lax.convert_element_type(x, jnp.int32), (scalar,))
 
 
 def _within(graph: Graph, index: Scalar, last: int) -> Scalar:
-    return graph.apply(MIN, graph.apply(MAX, _index(index), np.int32(0)), np.int32(last))
+    return graph.apply(MIN, graph.apply(MAX, _index(graph, index), np.int32(0)), np.int32(last))
 
 
 def _dynamic_slice(interpreter: _InKernel, equation: Any, whole: Whole, start: list[Value]) -> Value:
@@ -187,13 +174,16 @@ def _gather(interpreter: _InKernel, equation: Any, whole: Whole, operands: list[
         lasts = [full - size for full, size in zip(view.shape, plan.sizes, strict=True)]
         at = _moved(graph, view, [_within(graph, i, last) for i, last in zip(start, lasts, strict=True)])
         places = [_flat(view.strides, index) for index in np.ndindex(*plan.sizes)]
-        entries = interpreter.entries(view, at, places, whole.mapped)
+        entries = interpreter.entries(view, at, places)
         if not plan.clip:
             for i, last in zip(start, lasts, strict=True):
                 if is_constant(i):
                     entries = entries if 0 <= int(i) <= last else [plan.outside] * len(entries)
                     continue
-                low, high = graph.apply(GE, _index(i), np.int32(0)), graph.apply(LE, _index(i), np.int32(last))
+                low, high = (
+                    graph.apply(GE, _index(graph, i), np.int32(0)),
+                    graph.apply(LE, _index(graph, i), np.int32(last)),
+                )
                 entries = [graph.select(low, plan.outside, x) for x in entries]
                 entries = [graph.select(high, plan.outside, x) for x in entries]
         read += entries
@@ -242,18 +232,8 @@ def on_gpu(
 class _Operand:
     """An argument as the kernel finds it in memory."""
 
-    of_vehicle: bool
-    of_mission: bool
     aval: Any  # of one vehicle
-
-    def first(self, size: int, vehicle: jax.Array) -> Any:
-        """Index of each vehicle's first entry; ``vehicle`` counts them through all missions."""
-        entries = np.int32(self.aval.size)
-        if self.of_vehicle and self.of_mission:
-            return vehicle * entries
-        if self.of_vehicle:
-            return lax.rem(vehicle, np.int32(size)) * entries
-        return lax.div(vehicle, np.int32(size)) * entries if self.of_mission else np.int32(0)
+    rows: Rows
 
 
 def _launch(
@@ -266,7 +246,7 @@ def _launch(
 
     total = missions * size
     flags = zip(mapped, own, program.variables, strict=True)
-    operands = [_Operand(of_vehicle, of_mission, v.aval) for of_vehicle, of_mission, v in flags]
+    operands = [_Operand(v.aval, Rows(of_vehicle, of_mission, v.aval.size)) for of_vehicle, of_mission, v in flags]
     given = [(o, a) for o, a in zip(operands, arrays, strict=True) if _in_memory(o.aval)]
     outs = [v.aval for v in program.jaxpr.outvars]
     if not all(_in_memory(a) or a.size == 0 for a in outs) or any(not is_small(a, SMALL) for a in outs):
@@ -281,13 +261,12 @@ def _launch(
     def kernel(*refs: Any) -> None:
         place = pl.program_id(0) * block + lax.iota(jnp.int32, block)
         vehicle = lax.min(place, jnp.full(block, total - 1, jnp.int32))  # threads beyond the last one read the last
-        nothing, inputs, outputs = refs[0][0], refs[1 : 1 + len(given)], refs[1 + len(given) :]
-        interpreter = _InKernel(Graph(block), {**CONTROL, "scan": _scan}, program.unroll, nothing, vehicle)
-        results = _evaluated(program, size, operands, iter(inputs), interpreter)
-        for ref, aval, entries in zip(outputs, stored, results, strict=True):
-            for number, entry in enumerate(entries):
-                at = place * np.int32(aval.size) + np.int32(number)
-                triton.store(ref.at[at], entry, mask=place < total)
+        memory = Memory(size, vehicle)
+        graph = MemoryGraph(block, memory=memory)
+        (nothing,) = graph.values([graph.read(refs[0], Rows(False, False, 1), np.int32(0), 0)])
+        interpreter = _InKernel(graph, {**CONTROL, "scan": _scan}, program.unroll, nothing)
+        results = _evaluated(program, operands, iter(refs[1 : 1 + len(given)]), interpreter)
+        _store(place, total, list(zip(refs[1 + len(given) :], results, strict=True)))
 
     call = pl.pallas_call(
         kernel,
@@ -313,7 +292,7 @@ def _aliases(
     found = {}
     for result, (number, aval) in enumerate(zip(returned, outs, strict=False)):
         operand = operands[number]
-        whole = operand.of_vehicle and (operand.of_mission or missions == 1)
+        whole = operand.rows.of_vehicle and (operand.rows.of_mission or missions == 1)
         if whole and aval.size and (operand.aval.shape, operand.aval.dtype) == (aval.shape, aval.dtype):
             place = 1 + sum(_in_memory(o.aval) for o in operands[:number])
             found[place] = sum(a.size > 0 for a in outs[:result])
@@ -325,25 +304,19 @@ def _in_memory(aval: Any) -> bool:
     return not jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended) and aval.size > 0
 
 
-def _evaluated(
-    program: Program,
-    size: int,
-    operands: Sequence[_Operand],
-    refs: Any,
-    interpreter: _InKernel,
-) -> list[list[Any]]:
+def _evaluated(program: Program, operands: Sequence[_Operand], refs: Any, interpreter: _InKernel) -> list[list[Any]]:
     """Arrays [threads] of every entry of each result that is not empty."""
     known: dict[Any, Any] = dict(program.constants)
     for variable, operand in zip(program.variables, operands, strict=True):
-        aval, of_thread = operand.aval, operand.of_vehicle or operand.of_mission
+        aval, rows = operand.aval, operand.rows
         if not _in_memory(aval):
             empty = not jax.dtypes.issubdtype(aval.dtype, jax.dtypes.extended)
-            known[variable] = np.zeros(aval.shape, aval.dtype) if empty else Whole(None, of_thread)
+            known[variable] = np.zeros(aval.shape, aval.dtype) if empty else Whole(None, not rows.shared)
             continue
-        first = partial(operand.first, size)
-        view = _View(next(refs), first, np.int32(0), _row_major(aval.shape), aval.shape)
-        known[variable] = interpreter.of_view(view, of_thread, aval)
-    _read_together(interpreter, program, known)
+        view = _View(next(refs), rows, np.int32(0), _row_major(aval.shape), aval.shape)
+        known[variable] = interpreter.of_view(view, not rows.shared, aval)
+    live = needed(program.jaxpr, [True] * len(program.jaxpr.outvars))[1]
+    interpreter.settle([known[v] for v in program.variables if v in live])
     with np.errstate(all="ignore"):
         results = interpreter.evaluate(program.jaxpr, known)
         interpreter.settle(results)
@@ -353,24 +326,22 @@ def _evaluated(
     return [[_typed(x, aval) for x in interpreter.dump(value, aval, True)] for value, aval in outs]
 
 
-def _read_together(interpreter: _InKernel, program: Program, known: dict[Any, Any]) -> None:
-    """Read the scalars of all arguments that the program needs, in one branch that is always taken.
+def _store(place: jax.Array, total: int, results: Sequence[tuple[Any, list[Any]]]) -> None:
+    """Write the entries of each result [threads] to its array; the vehicle of a thread is the one at its ``place``."""
+    from jax.experimental.pallas import triton
 
-    From every access to memory Triton (`CoalescePass`) follows all that depends on it, for an order of accesses, but
-    not out of a branch: kernels with hundreds of reads are compiled in three quarters of the time.
-    """
-    live = needed(program.jaxpr, [True] * len(program.jaxpr.outvars))[1]
-    values = [known[v] for v in program.variables if v in live and not is_number(known[v])]
-    parts = {id(x): x for value in values if not isinstance(value, Whole) for x in value.reshape(-1)}
-    nodes = [x for x in parts.values() if isinstance(x, Node) and x.mapped and x.value is None]
+    sizes = {len(entries) for _, entries in results}
+    firsts = [place * np.int32(size) for size in sizes]
 
-    def read() -> list[Any]:
-        return [node.compute() for node in nodes]
+    def work(number: Numbers, given: Sequence[Any]) -> list[Any]:
+        written, *rest = given
+        first, left = dict(zip(sizes, rest, strict=False)), iter(rest[len(sizes) :])
+        for ref, entries in results:
+            for at in range(len(entries)):
+                triton.store(ref.at[number.after(at, first[len(entries)])], next(left), mask=written)
+        return []
 
-    kinds = jax.eval_shape(read)
-    found = lax.cond(interpreter.nothing == 0, read, lambda: [jnp.zeros(k.shape, k.dtype) for k in kinds])
-    for node, value in zip(nodes, found, strict=True):
-        node.value = value
+    apart(work, [place < total, *firsts, *(x for _, entries in results for x in entries)], [])
 
 
 def _typed(entry: Any, aval: Any) -> Any:
