@@ -12,21 +12,24 @@ from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site, sample
+from swarmsim.site.surfaces import DEPTHS, PARALLEL_M, Box, least, matter, most, scattered_share, thin_m_of
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
 NEIGHBOURS = 16  # segments that are intersected with the same clusters of boxes
+PAIRS = 128  # of a segment and a box, of which shares are computed at a time
 CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
+_UPPER = -(1 << 16)  # mask of a number's upper half
 _TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
-_PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is parallel to the slab
 
 
 @pytree
 class Shape:
-    """What decides how much of the photons that scatter in walls arrives: see `swarmsim.radiation.scattering`."""
+    """What decides how much of the photons that scatter in walls arrives: see `swarmsim.radiation.walls`."""
 
     thin_m: jax.Array  # [..., M] length the shortest way through each piece of matter that is crossed; <= length_m
-    spread: jax.Array  # [...] 0..1: part of an infinite wall's scattered photons that come from a wall of its size
-    closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box, whose other walls scatter too
+    share: jax.Array  # [..., DEPTHS] photons that walls scatter, over those of infinite walls crossed squarely
+    closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box
+    walls: jax.Array  # [...] 1..2: walls of a box that are crossed in turn
     ground: jax.Array  # [..., 2] how the ground shines, see `mirrored`
 
 
@@ -47,9 +50,15 @@ def stretched(way: Crossed, factors: jax.Array) -> Crossed:
 
 def nothing_crossed(n: int, materials: int) -> Crossed:
     """Of n segments that have no length."""
-    zero, row = jnp.zeros((n, materials)), jnp.zeros(n)
-    return Crossed(
-        length_m=zero, place=zero, shape=Shape(thin_m=zero, spread=row, closed=row, ground=jnp.zeros((n, 2)))
+    zero = jnp.zeros((n, materials))
+    return Crossed(length_m=zero, place=zero, shape=wide(zero, jnp.zeros((n, 2))))
+
+
+def wide(thin_m: jax.Array, ground: jax.Array) -> Shape:
+    """That of infinite walls crossed squarely: ``thin_m`` [..., M], ``ground`` [..., 2]."""
+    one = jnp.ones(thin_m.shape[:-1])
+    return Shape(
+        thin_m=thin_m, share=jnp.ones((*one.shape, len(DEPTHS))), closed=jnp.zeros_like(one), walls=one, ground=ground
     )
 
 
@@ -67,10 +76,14 @@ def crossed(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
     The terrain is crossed exactly too (`swarmsim.site.terrain_crossing`). Lengths are continuous in both ends and
     differentiable almost everywhere; of the rest ``thin_m`` and ``ground`` are, the others are constants to
-    derivatives. Where obstacles overlap, the lengths are scaled so that their sum does not exceed the distance. The
-    remaining distance is that through ``air`` if the table has it, and then the sum equals the distance.
+    derivatives. The ``shape`` knows two boxes, those with the longest short ways; others count as wide walls, and the
+    two do so too as far as a third is as long. Where obstacles overlap, the lengths are scaled so that their sum does
+    not exceed the distance. The remaining distance is that through ``air`` if the table has it, and then the sum equals
+    the distance.
     """
-    return _crossed(site, above_of(site), a, b)
+    way = _way(site, above_of(site), a, b)
+    every = _shaped(site.obstacles, a[None], b[None], jax.tree.map(lambda x: x[None], way))
+    return jax.tree.map(lambda x: x[0], every)
 
 
 def above_of(site: Site) -> Ceilings:
@@ -78,7 +91,100 @@ def above_of(site: Site) -> Ceilings:
     return ceilings(site.terrain_m) if site.above is None else site.above
 
 
-def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes | None" = None) -> Crossed:
+@pytree
+class _Longest:
+    """The three boxes with the longest short ways, for segments [...]: see `_key`; 0 for none."""
+
+    first: jax.Array  # [...] int32
+    second: jax.Array
+    third: jax.Array
+
+
+def _key(thin: jax.Array, number: jax.Array) -> jax.Array:
+    """A number that grows with ``thin`` [...] >= 0 to 1 %, and holds the box's ``number`` in its lower half."""
+    bits = jax.lax.bitcast_convert_type(thin, jnp.int32)  # it grows with the value
+    return jnp.where(thin > 0.0, (bits & _UPPER) | number, 0)
+
+
+def _of_both(one: _Longest, other: _Longest) -> _Longest:
+    """The same of the boxes of either."""
+    lower, seconds = jnp.minimum(one.first, other.first), jnp.maximum(one.second, other.second)
+    rest = jnp.maximum(jnp.minimum(lower, seconds), jnp.minimum(one.second, other.second))
+    return _Longest(
+        first=jnp.maximum(one.first, other.first),
+        second=jnp.maximum(lower, seconds),
+        third=jnp.maximum(rest, jnp.maximum(one.third, other.third)),
+    )
+
+
+def _nothing_met() -> _Longest:
+    none = jnp.zeros((), jnp.int32)
+    return _Longest(first=none, second=none, third=none)
+
+
+@pytree
+class _Way:
+    """What is known of a segment before its `Shape`."""
+
+    crossed: Crossed  # without a shape
+    thin_m: jax.Array  # [M]
+    ground: jax.Array  # [2]
+    walls_m: jax.Array  # [] length the short way in all but air
+    met: _Longest
+
+
+def _shaped(boxes: Obstacles, a: jax.Array, b: jax.Array, way: _Way, size: int | None = None) -> Crossed:
+    """``way`` [n] from ``a`` [n, 3] to ``b`` [n, 3] with its shape.
+
+    With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together.
+    """
+    a, b, n = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b), b.shape[0]
+    keys = jnp.concatenate([way.met.first, way.met.second])
+    # the third's, longer by what two keys may differ without being in order
+    third = jax.lax.cond(
+        jnp.any(way.met.third > 0),
+        lambda: jnp.where(way.met.third > 0, 1.02 * thin_m_of(_box(boxes, way.met.third, a, b)), 0.0),
+        lambda: jnp.zeros(n),
+    )
+
+    def of(pair: jax.Array) -> jax.Array:
+        """Length the short way, share less 1, closed, and walls less 1 [DEPTHS + 3, k] of pairs [k]."""
+        row = pair % n
+        found = scattered_share(_box(boxes, keys[pair], a[row], b[row]))
+        return jnp.stack([found.thin_m, *(x - 1.0 for x in found.share), found.closed, found.walls - 1.0])
+
+    each = (of(jnp.arange(2 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 2, n)
+    weight = jnp.where(keys.reshape(2, n) > 0, jnp.maximum(each[0] - third, 0.0), 0.0) / jnp.maximum(way.walls_m, 1e-9)
+    more = [jnp.sum(jnp.where(weight > 0.0, weight * x, 0.0), axis=0) for x in each[1:]]
+    share = 1.0 + jnp.stack(more[:-2], axis=-1)
+    shape = Shape(thin_m=way.thin_m, share=share, closed=more[-2], walls=1.0 + more[-1], ground=way.ground)
+    return replace(way.crossed, shape=shape)
+
+
+def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int) -> jax.Array:
+    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; of the others anything."""
+    n, place = wanted.shape[0], jnp.cumsum(wanted.astype(jnp.int32)) - 1
+    size = min(size, n)
+    rows = jnp.zeros(n + size, jnp.int32).at[jnp.where(wanted, place, n + size)].set(jnp.arange(n), mode="drop")
+    found = jnp.zeros((len(DEPTHS) + 3, n + size))
+
+    def step(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        first, found = carry
+        own = function(jax.lax.dynamic_slice(rows, (first,), (size,)))
+        return first + size, jax.lax.dynamic_update_slice(found, own, (jnp.zeros_like(first), first))
+
+    _, found = jax.lax.while_loop(lambda carry: carry[0] <= place[-1], step, (jnp.zeros((), jnp.int32), found))
+    return found[:, jnp.maximum(place, 0)]
+
+
+def _box(boxes: Obstacles, key: jax.Array, a: jax.Array, b: jax.Array) -> Box:
+    """The boxes of these keys [n], with segments from ``a`` [n, 3] to ``b`` [n, 3]."""
+    own = jax.tree.map(lambda x: jnp.take(x, key & ~_UPPER, axis=0, mode="clip"), boxes)
+    start, end = (_in_axes(own, x - own.centre_m) for x in (a, b))
+    return Box(start, end, [own.half_extent_m[:, k] for k in range(3)], own.wall_m)
+
+
+def _way(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes | None" = None) -> _Way:
     direction = b - a
     squared = jnp.sum(direction * direction)
     distance = jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
@@ -97,10 +203,12 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Bo
     if "air" in site.material_names:
         rest = jnp.where(materials == site.material_names.index("air"), jnp.maximum(1.0 - total, 0.0), 0.0)
         fractions, thin = fractions + rest, thin + rest
-    spread, closed = 1.0 - jnp.sum(found.narrow) / walls, jnp.sum(found.closed) / walls
-    place, spread, closed = jax.lax.stop_gradient((jnp.clip(place, 0.0, 1.0), spread, closed))
-    shape = Shape(thin_m=distance * thin, spread=spread, closed=closed, ground=mirrored(site, a, b))
-    return Crossed(length_m=distance * fractions, place=place, shape=shape)
+    place = jax.lax.stop_gradient(jnp.clip(place, 0.0, 1.0))
+    crossed = Crossed(length_m=distance * fractions, place=place)
+    thin_m, ground = distance * thin, mirrored(site, a, b)
+    return _Way(
+        crossed=crossed, thin_m=thin_m, ground=ground, walls_m=jax.lax.stop_gradient(distance * walls), met=found.met
+    )
 
 
 def mirrored(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
@@ -129,29 +237,29 @@ def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     Within a cluster the boxes are the vectorised axis.
     """
     n, above, clusters = b.shape[0], above_of(site), _clusters(site.obstacles)
+    every = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clusters)
+    firsts = jnp.arange(0, every.wall_m.shape[0], CLUSTER)
     size = min(NEIGHBOURS, n)
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
 
-    def block(ends: jax.Array) -> Crossed:
+    def block(ends: jax.Array) -> _Way:
         near = jax.lax.map(lambda boxes: jnp.any(_near(boxes, a, ends)), clusters)
 
         def of_clusters(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
-            def add(found: _Found, cluster: tuple[Obstacles, jax.Array]) -> tuple[_Found, None]:
+            def add(found: _Found, cluster: tuple[Obstacles, jax.Array, jax.Array]) -> tuple[_Found, None]:
                 def met(found: _Found) -> _Found:
-                    own = _all_boxes(replace(site, obstacles=cluster[0]), a, direction, distance)
-                    own = replace(own, narrow=jnp.sum(own.narrow), closed=jnp.sum(own.closed))
-                    return jax.tree.map(jnp.add, found, own)
+                    return _together(
+                        found, _all_boxes(replace(site, obstacles=cluster[0]), a, direction, distance, cluster[2])
+                    )
 
                 return jax.lax.cond(cluster[1], met, lambda found: found, found), None
 
-            zero, one = jnp.zeros(len(site.material_names)), jnp.zeros(())
-            nothing = _Found(share=zero, moment=zero, thin=zero, narrow=one, closed=one)
-            return jax.lax.scan(add, nothing, (clusters, near))[0]
+            return jax.lax.scan(add, _nothing_found(len(site.material_names)), (clusters, near, firsts))[0]
 
-        return jax.vmap(lambda end: _crossed(site, above, a, end, of_clusters))(ends)
+        return jax.vmap(lambda end: _way(site, above, a, end, of_clusters))(ends)
 
-    found = jax.lax.map(block, ends)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
+    ways = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], jax.lax.map(block, ends))
+    return _shaped(every, jnp.broadcast_to(a, b.shape), b, ways, PAIRS)
 
 
 def _clusters(boxes: Obstacles) -> Obstacles:
@@ -187,11 +295,11 @@ def _near(boxes: Obstacles, a: jax.Array, ends: jax.Array) -> jax.Array:
     last = jnp.where(length > around, (radius + share * length) / jnp.maximum(length - around, 1e-6), 1.0)
     larger = boxes.half_extent_m + (around * jnp.minimum(last, 1.0) + _TOUCH_M)[:, None]
     start, along = _in_axes(boxes, -offset), _in_axes(boxes, direction)
-    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
+    inverse = [1.0 / jnp.where(jnp.abs(d) < PARALLEL_M, PARALLEL_M, d) for d in along]
     reach = [jnp.abs(i) * larger[:, k] for k, i in enumerate(inverse)]
     middles = [-x * i for x, i in zip(start, inverse, strict=True)]
-    enter = jnp.maximum(_most([m - r for m, r in zip(middles, reach, strict=True)]), 0.0)
-    leave = jnp.minimum(_least([m + r for m, r in zip(middles, reach, strict=True)]), 1.0)
+    enter = jnp.maximum(most([m - r for m, r in zip(middles, reach, strict=True)]), 0.0)
+    leave = jnp.minimum(least([m + r for m, r in zip(middles, reach, strict=True)]), 1.0)
     # an end that is no number (padding may hold anything) must not hide a box from its neighbours
     return ~(leave < enter) & (radius > 0.0)
 
@@ -213,39 +321,62 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
     nothing, shapes = np.zeros(1, np.float32), above.shapes
     bare = jax.tree.map(lambda _: nothing, site)
 
-    def one(end: jax.Array, start: jax.Array, needed: Any, highest: jax.Array) -> Crossed:
+    def one(end: jax.Array, start: jax.Array, needed: Any, highest: jax.Array) -> _Way:
         boxes, terrain, origin, cell, ground = needed
         here = replace(bare, obstacles=boxes, terrain_m=terrain, origin_m=origin, cell_m=cell, ground_material=ground)
-        return _crossed(here, Ceilings(highest_m=highest, shapes=shapes), start, end, _box_after_box)
+        return _way(here, Ceilings(highest_m=highest, shapes=shapes), start, end, _box_after_box)
 
     starts = jnp.broadcast_to(a, b.shape)
-    found: Crossed = over_vehicles(one, (0, 0, None, None), platform=platform)(b, starts, needed, above.highest_m)
-    return found
+    ways: _Way = over_vehicles(one, (0, 0, None, None), platform=platform)(b, starts, needed, above.highest_m)
+    return _shaped(site.obstacles, starts, b, ways)
 
 
 @pytree
 class _Found:
-    """What a segment crosses of each box [K], or of the boxes of each material [M]; lengths over the segment's."""
+    """What a segment crosses of the boxes of each material [M]; lengths over the segment's."""
 
     share: jax.Array
     moment: jax.Array  # integral of the place over the part inside
-    thin: jax.Array  # the shortest way through the box's matter
-    narrow: jax.Array  # that, times the missing part of an infinite wall
-    closed: jax.Array  # that, for a box that one end of the segment lies in
+    thin: jax.Array  # the shortest way through each box's matter
+    met: _Longest
+
+
+def _nothing_found(materials: int) -> _Found:
+    zero = jnp.zeros(materials)
+    return _Found(share=zero, moment=zero, thin=zero, met=_nothing_met())
+
+
+def _together(one: _Found, other: _Found) -> _Found:
+    return _Found(
+        share=one.share + other.share, moment=one.moment + other.moment, thin=one.thin + other.thin,
+        met=_of_both(one.met, other.met),
+    )  # fmt: skip
 
 
 Boxes = Callable[[Site, jax.Array, jax.Array, jax.Array], _Found]
 """What a segment meets [M]; it starts at a place [3], and is given as a vector [3] and that vector's length []."""
 
 
-def _all_boxes(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
+def _all_boxes(
+    site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array, first: jax.Array | int = 0
+) -> _Found:
+    """Of all boxes of the site, the numbers of which begin with ``first``."""
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
     one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
+    share, moment, thin = _of_boxes(site.obstacles, a, direction, distance)
     # Matrix product: a masked sum would dominate the cost.
-    found = _of_boxes(site.obstacles, a, direction, distance)
-    stacked = jnp.stack([found.share, jax.lax.stop_gradient(found.moment), found.thin])
-    share, moment, thin = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
-    return _Found(share=share, moment=moment, thin=thin, narrow=found.narrow, closed=found.closed)
+    stacked = jnp.stack([share, jax.lax.stop_gradient(moment), thin])
+    sums = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
+    return _Found(share=sums[0], moment=sums[1], thin=sums[2], met=_longest(jax.lax.stop_gradient(thin), first))
+
+
+def _longest(thin: jax.Array, first: jax.Array | int) -> _Longest:
+    """Those of boxes with short ways ``thin`` [K], the numbers of which begin with ``first``."""
+    key = _key(thin, jnp.arange(thin.shape[0], dtype=jnp.int32) + first)
+    most = jnp.max(key)
+    rest = jnp.where(key == most, 0, key)
+    second = jnp.max(rest)
+    return _Longest(first=most, second=second, third=jnp.max(jnp.where(rest == second, 0, rest)))
 
 
 def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
@@ -253,70 +384,19 @@ def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax
 
     def add(k: jax.Array, found: _Found) -> _Found:
         box = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 1), boxes)
-        met = _of_boxes(box, a, direction, distance)
-        own = box.material == materials
-        share, moment, thin = (jnp.where(own, x, 0.0) for x in (met.share, met.moment, met.thin))
-        each = _Found(share=share, moment=moment, thin=thin, narrow=met.narrow, closed=met.closed)
-        return jax.tree.map(jnp.add, found, each)
+        lengths = _of_boxes(box, a, direction, distance)
+        own, met = box.material == materials, jax.lax.stop_gradient(lengths[2][0])
+        share, moment, thin = (jnp.where(own, x, 0.0) for x in lengths)
+        each = replace(_nothing_met(), first=_key(met, jnp.asarray(k, jnp.int32)))
+        return _together(found, _Found(share=share, moment=moment, thin=thin, met=each))
 
-    zero, one = jnp.zeros(materials.shape), jnp.zeros(1)
-    nothing = _Found(share=zero, moment=zero, thin=zero, narrow=one, closed=one)
-    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, nothing)
+    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, _nothing_found(materials.shape[0]))
 
 
-def _of_boxes(obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
-    """What the segment crosses of each box [K]. Written per component, so that the boxes are the vectorised axis."""
+def _of_boxes(
+    obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`matter` of each box [K]. Written per component, so that the boxes are the vectorised axis."""
     start, along = _in_axes(obstacles, a - obstacles.centre_m), _in_axes(obstacles, direction)
-    # Clamp a component that is too small to divide by: the slab then extends far beyond the segment.
-    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
-    middle = [-x * i for x, i in zip(start, inverse, strict=True)]
-    reach = [jnp.abs(i) for i in inverse]
-    outer = [obstacles.half_extent_m[:, k] for k in range(3)]
-    inner = [half - obstacles.wall_m for half in outer]
-    hollow = (obstacles.wall_m > 0.0) & (_least(inner) > 0.0)
-    (enter, leave), (whole, of_whole) = _slab_fraction(middle, reach, outer)
-    _, (empty, of_empty) = _slab_fraction(middle, reach, inner)
-    share = whole - jnp.where(hollow, empty, 0.0)
-    moment = of_whole - jnp.where(hollow, of_empty, 0.0)
-    first, last = _most(enter), _least(leave)
-    within = (first < 0.0) != (last > 1.0)
-    shortest = jnp.where(hollow, jnp.where(within, 1.0, 2.0) * obstacles.wall_m, 2.0 * _least(outer))
-    thin = jnp.minimum(share, shortest / jnp.maximum(distance, 1e-9))
-    # The face that the segment leaves the box by, or enters it by if it ends inside, and how far its edges are
-    at = jnp.where(last < 1.0, last, first)
-    faces = [jnp.where(last < 1.0, leave[k], enter[k]) == at for k in (0, 1)]
-    place = [x + at * d for x, d in zip(start, along, strict=True)]
-    (one, other), (wide, high) = (
-        (jnp.where(faces[0], x[1], x[0]), jnp.where(faces[0] | faces[1], x[2], x[1])) for x in (place, outer)
-    )
-    per_share = 1.0 / jnp.maximum(share, 1e-9)
-    mean = moment * per_share
-    scale = jnp.square(distance * thin * per_share * mean * (1.0 - mean)) + 1e-12
-    missing = 1.0 - _seen(one, wide, scale) * _seen(other, high, scale)
-    closed = jnp.where(hollow & within, thin, 0.0)
-    return _Found(share=share, moment=moment, thin=thin, narrow=thin * missing, closed=closed)
-
-
-def _seen(place: jax.Array, half: jax.Array, scale2: jax.Array) -> jax.Array:
-    """Part [K] of an infinite wall's scattered photons from a strip of it, -/+ ``half`` wide, around ``place``."""
-    ahead, behind = half - place, half + place
-    return 0.5 * (ahead * jax.lax.rsqrt(ahead * ahead + scale2) + behind * jax.lax.rsqrt(behind * behind + scale2))
-
-
-def _most(x: list[jax.Array]) -> jax.Array:
-    return jnp.maximum(jnp.maximum(x[0], x[1]), x[2])
-
-
-def _least(x: list[jax.Array]) -> jax.Array:
-    return jnp.minimum(jnp.minimum(x[0], x[1]), x[2])
-
-
-def _slab_fraction(
-    middle: list[jax.Array], reach: list[jax.Array], half: list[jax.Array]
-) -> tuple[tuple[list[jax.Array], list[jax.Array]], tuple[jax.Array, jax.Array]]:
-    """Where lines enter and leave slabs at middle -/+ reach half; the share [K] of 0 <= t <= 1 in all, its moment."""
-    enter = [m - r * h for m, r, h in zip(middle, reach, half, strict=True)]
-    leave = [m + r * h for m, r, h in zip(middle, reach, half, strict=True)]
-    first, last = jnp.maximum(_most(enter), 0.0), jnp.minimum(_least(leave), 1.0)
-    share = jnp.maximum(last - first, 0.0)
-    return (enter, leave), (share, share * 0.5 * (jnp.minimum(first, 1.0) + jnp.maximum(last, 0.0)))
+    half = [obstacles.half_extent_m[:, k] for k in range(3)]
+    return matter(start, along, half, obstacles.wall_m, distance)
