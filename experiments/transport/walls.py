@@ -2,12 +2,12 @@
 
     python -m experiments.transport.walls [--seeds 3] [--photons N] [--out FOLDER]
 
-writes ``walls.csv``, prints how far the model is from the Monte Carlo, and the constants that fit best: those of
-``configs/elements/walls.csv``. Twenty minutes on one core.
+writes ``walls.csv``, prints how far the model is from the Monte Carlo, and the constants that fit best, as the rows of
+``configs/elements/walls.csv``. Thirty minutes on one core.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -25,20 +25,35 @@ from experiments.transport.sites import Block, modelled, site_of, ways
 from experiments.transport.tables import write_table
 from experiments.transport.walk import Floats, Medium, medium
 from swarmsim.radiation import Detector, load_library
-from swarmsim.radiation.walls import Constants, constants, scattered_counts
+from swarmsim.radiation.walls import scattered_counts
 from swarmsim.site import Crossed
+from swarmsim.site.surfaces import Box, Constants, constants, scattered_share
 
 ENERGIES = (60.0, 122.0, 356.0, 662.0, 1332.0), (0.1, 0.2, 0.2, 0.25, 0.25)  # and how often they are drawn
 MATERIALS = ("concrete", "brick", "steel", "lead"), (0.4, 0.25, 0.25, 0.1)
 THICKNESS_M = {"concrete": (0.04, 0.3), "brick": (0.08, 0.36), "steel": (0.001, 0.02), "lead": (0.001, 0.02)}
-RUNS = {"inside": 30, "wall": 24, "behind": 14}  # of each seed
+RUNS = {"inside": 30, "container": 8, "wall": 24, "behind": 14}  # of each seed
 TOLD = {
     "inside": "in a closed building",
+    "container": "in a container of steel",
     "wall": "a free-standing wall between",
     "behind": "a closed building between",
 }
+ENCLOSED = ("inside", "container")  # the source
 VIEWS = 8
 COLLISIONS = 30
+POSITIVE = (
+    "width",
+    "softer",
+    "forward",
+    "back",
+    "between_slant",
+    "between_steep",
+    "lost",
+    "lost_slant",
+)  # constants of which the logarithms are fitted
+MOST_STEPS = 40
+FLAT = 0.07  # deviation of a logarithm above which a case counts less
 KNOWN = 0.06  # relative error of the Monte Carlo above which a case is left out
 
 app = App(name="walls", help=__doc__, help_format="plaintext")
@@ -84,8 +99,11 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
     if energy < 100.0 and material in ("concrete", "brick"):
         thickness = min(thickness, 0.12)
     x, y, z = between(1.0, 7.0), between(1.0, 7.0), between(2.2, 8.0)
+    if kind == "container":
+        material, thickness = "steel", between(0.001, 0.006)
+        x, y, z = 0.5 * between(2.0, 12.2), 0.5 * between(2.0, 2.6), between(2.0, 3.0)
     low, high = np.array([-x, -y, 0.0]), np.array([x, y, z])
-    if kind == "inside":
+    if kind in ENCLOSED:
         least, most = low + thickness, high - thickness
         margin = np.minimum(0.25, 0.3 * (most - least))
         source = rng.uniform(least + margin, most - margin)
@@ -103,7 +121,7 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
         level = rng.random() >= 0.5
         elevation = rng.normal(0.0, 0.15) if level else np.arcsin(rng.uniform(-0.1, 1.0))
         azimuth = rng.uniform(0.0, 2.0 * np.pi)
-        if kind != "inside":
+        if kind not in ENCLOSED:
             azimuth, elevation = rng.normal(0.0, 0.8), abs(elevation)
         way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         ends = np.sort((np.array([low, high]) - source) / np.where(np.abs(way) < 1e-9, 1e-9, way), axis=0)
@@ -124,8 +142,16 @@ def shell_of(low: Floats, high: Floats, wall_m: float) -> Floats:
     ])  # fmt: skip
 
 
-def cases(name: str, seeds: int, photons: int) -> Iterator[tuple[list[Case], Crossed]]:
-    """The views of every kind and run, and what lies between; the last seed is not fitted to."""
+def lines_of(case: Drawn) -> Floats:
+    """Source, detectors, half extents and the thickness of the wall [VIEWS, 10] in the axes of the box."""
+    low, high = (np.array(x) for x in (case.block.low_m, case.block.high_m))
+    middle, one = 0.5 * (low + high), np.ones((len(case.detectors_m), 1))
+    wall = one * case.block.wall_m
+    return np.hstack([one * (case.source_m - middle), case.detectors_m - middle, one * 0.5 * (high - low), wall])
+
+
+def cases(name: str, seeds: int, photons: int) -> Iterator[tuple[list[Case], Floats, Crossed]]:
+    """The views of every kind and run, their `lines_of`, and what lies between; the last seed is not fitted to."""
     library = load_library()
     detector, (grid, counted) = detector_of(library, name), efficiency(library, name)
 
@@ -152,6 +178,7 @@ def cases(name: str, seeds: int, photons: int) -> Iterator[tuple[list[Case], Cro
                     Case(kind, case.material, case.energy_kev, case.block.wall_m, seed, run, *row[:3], float(row[3]))
                     for row in zip(*mc, direct + scattered, strict=True)
                 ],
+                lines_of(case),
                 way,
             )
 
@@ -175,27 +202,45 @@ def known(found: list[Case]) -> list[Case]:
     return [c for c, counts in total if counts > FAINT and c.error < KNOWN * counts]
 
 
-def fitted(found: list[Case], way: Crossed, detector: Detector) -> Constants:
-    """The constants that bring the model nearest to the Monte Carlo: least squares of logarithms, robust."""
+def fitted(found: list[Case], lines: Floats, way: Crossed, detector: Detector, start: Constants) -> Constants:
+    """The constants that bring the model nearest to the Monte Carlo: least squares of logarithms, robust.
+
+    ``lines`` are the `lines_of` the cases; every case crosses one box.
+    """
     chosen = set(map(id, known(found)))
-    rows = [i for i, c in enumerate(found) if id(c) in chosen]
+    rows = np.array([i for i, c in enumerate(found) if id(c) in chosen])
     number = jnp.array([ENERGIES_KEV.index(found[i].energy_kev) for i in rows])
-    some = jax.tree.map(lambda x: x[np.array(rows)], way)
-    direct, scattered = (np.array([getattr(found[i], name) for i in rows]) for name in ("uncollided", "scattered"))
+    some, places = jax.tree.map(lambda x: x[rows], way), list(jnp.asarray(lines[rows].T, jnp.float32))
+    box = Box(places[:3], places[3:6], places[6:9], places[9])
+    direct, scattered = (
+        jnp.array([getattr(found[i], name) for i in rows], jnp.float32) for name in ("uncollided", "scattered")
+    )
+    log = [name in POSITIVE for name in Constants._fields]
 
-    @jax.jit
-    def counts(values: tuple[float, ...]) -> jax.Array:
+    def of(values: Floats | jax.Array) -> Constants:
+        return Constants(*(jnp.exp(x) if is_log else x for x, is_log in zip(values, log, strict=True)))
+
+    def apart(values: jax.Array) -> jax.Array:
+        k = of(values)
+        assert some.shape is not None
+        seen = replace(some, shape=replace(some.shape, share=jnp.stack(scattered_share(box, k).share, axis=-1)))
+
         def one(number: jax.Array, way: Crossed) -> jax.Array:
-            mu, tables = detector.attenuation_1_m[number], detector.scatter_1_m[number]
-            return scattered_counts(mu, tables, None, way, Constants(*values)).counts[0]
+            tables = (detector.attenuation_1_m, detector.scatter_1_m, detector.line_energy_kev)
+            return scattered_counts(*(x[number] for x in tables), None, way, k).counts[0]
 
-        return jax.vmap(one)(number, some)
+        return jnp.log((direct + jax.vmap(one)(number, seen)) / (direct + scattered))
 
-    def apart(values: Floats) -> Floats:
-        return np.log((direct + np.asarray(counts(tuple(values)), float)) / (direct + scattered))
-
-    start = np.array(constants())
-    return Constants(*least_squares(apart, start, bounds=(0.0, np.inf), loss="soft_l1", f_scale=0.1, diff_step=1e-2).x)
+    value, slope = jax.jit(apart), jax.jit(jax.jacfwd(apart))
+    best = least_squares(
+        lambda x: np.asarray(value(jnp.asarray(x, jnp.float32)), float),
+        [np.log(x) if is_log else x for x, is_log in zip(start, log, strict=True)],
+        jac=lambda x: np.asarray(slope(jnp.asarray(x, jnp.float32)), float),
+        loss="cauchy",
+        f_scale=FLAT,
+        max_nfev=MOST_STEPS,
+    )
+    return Constants(*map(float, of(best.x)))
 
 
 @app.default
@@ -207,9 +252,10 @@ def main(
 ) -> None:  # fmt: skip
     """Compare, fit, and write the table."""
     found: list[Case] = []
-    parts = []
-    for own, way in cases(detector, seeds, photons):
+    lines, parts = [], []
+    for own, ends, way in cases(detector, seeds, photons):
         found += own
+        lines.append(ends)
         parts.append(way)
     write_table(out / "walls.csv", found)
     print(told(found))
@@ -217,8 +263,10 @@ def main(
     print("Those that were not fitted to:\n" + told([c for c in found if c.seed == last]))
     rows = np.array([i for i, c in enumerate(found) if c.seed < max(last, 2)])
     way = jax.tree.map(lambda *x: jnp.concatenate(x)[rows], *parts)
-    best = fitted([found[i] for i in rows], way, detector_of(load_library(), detector))
-    print("Constants: " + ", ".join(f"{name} {value:.3g}" for name, value in best._asdict().items()))
+    best = fitted(
+        [found[i] for i in rows], np.vstack(lines)[rows], way, detector_of(load_library(), detector), constants()
+    )
+    print("Constants:\n" + "\n".join(f"{name},{value:.4g}" for name, value in best._asdict().items()))
 
 
 if __name__ == "__main__":

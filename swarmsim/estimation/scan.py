@@ -16,7 +16,7 @@ from swarmsim.pytree import on_device, pytree
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.ground import basis
 from swarmsim.radiation.rate import roi_rates_and_slopes
-from swarmsim.site.rays import Crossed, Shape
+from swarmsim.site.rays import Crossed, wide
 
 NODES_M = (3.0, 10.0, 30.0, 100.0)
 """Distances at which the rates are computed; rates times squared distance are linear between them."""
@@ -41,10 +41,9 @@ def open_rates(detector: Detector, nuclides: int, air: int) -> jax.Array:
     place = jnp.stack([distance * SINE, zero, distance * (1.0 - SINE**2) ** 0.5], axis=-1)
     up = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), place.shape)
     length = jnp.zeros((len(NODES_M), len(detector.material_names))).at[:, air].set(distance)
-    far, none = np.array(NODES_M), jnp.zeros_like(distance)
+    far = np.array(NODES_M)
     ground = on_device(basis(HEIGHT_M, HEIGHT_M + far * (1.0 - SINE**2) ** 0.5, far * SINE))
-    shape = Shape(thin_m=length, spread=none + 1.0, closed=none, ground=ground)
-    way = Crossed(length_m=length, place=jnp.full_like(length, 0.5), shape=shape)
+    way = Crossed(length_m=length, place=jnp.full_like(length, 0.5), shape=wide(length, ground))
 
     def of(nuclide: jax.Array) -> jax.Array:
         source = Source(position_m=jnp.zeros(3), activity_bq=jnp.ones(()), nuclide=nuclide)

@@ -62,7 +62,8 @@ def transmission(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[
 
 def _scattered(detector: Detector, nuclide: jax.Array, way: Crossed) -> Scattered:
     air = detector.material_names.index(AIR) if AIR in detector.material_names else None
-    return scattered_counts(detector.attenuation_1_m[nuclide], detector.scatter_1_m[nuclide], air, way)
+    tables = (detector.attenuation_1_m[nuclide], detector.scatter_1_m[nuclide], detector.line_energy_kev[nuclide])
+    return scattered_counts(*tables, air, way)
 
 
 def _seen(detector: Detector, source: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
@@ -207,7 +208,7 @@ def roi_rates_and_slopes(
     shares, peaks = shares + ground, peaks + ground  # [n, L, R]
     rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
     slants = found.slant_layers[..., chosen]  # [n, L, U]
-    changes = layers[..., chosen] * found.by_depth[..., None] + slants * found.by_slant[..., None]
+    changes = layers[..., chosen] * found.by_depth[..., None]
     if AIR in detector.material_names:
         air = chosen == detector.material_names.index(AIR)
         changes -= jnp.where(air, layers[..., chosen] * found.by_walls[..., None], 0.0)

@@ -19,7 +19,7 @@ from swarmsim.radiation.detector import AIR, Detector
 from swarmsim.radiation.lines import DEPTHS, GROUND, SHIELDS
 from swarmsim.radiation.rate import from_ground, scattered_shares, transmission
 from swarmsim.radiation.strangers import shield_count
-from swarmsim.site.rays import Crossed, Shape
+from swarmsim.site.rays import Crossed, wide
 
 AIR_M = (60.0,)
 """Lengths of the ways in air of the templates."""
@@ -99,8 +99,7 @@ def _counts(
     ``above`` [] is 1 where the ground shines as much as it can, 0 without a ground.
     """
     places, ground = jnp.full(len(detector.material_names), place), jnp.full(2, above)
-    shape = Shape(thin_m=length_m, spread=jnp.ones(()), closed=jnp.zeros(()), ground=ground)
-    way = Crossed(length_m=length_m, place=places, shape=shape)
+    way = Crossed(length_m=length_m, place=places, shape=wide(length_m, ground))
     lines = _bare_lines(detector, nuclide)
     direct, scattered = transmission(detector, nuclide, way)
     of_ground = (lines * (direct + scattered) * from_ground(detector, nuclide, way)) @ detector.ground_bins[nuclide]

@@ -1,39 +1,31 @@
 """Photons scattered by walls that are not infinitely wide, or that the line crosses at an angle (device side).
 
-The tables of `swarmsim.radiation.scattering` hold for a slab of infinite width that the line crosses squarely. Of a
-wall that the line crosses at an angle with cosine c, with the depth t the short way through (c t' on the line),
+The tables of `swarmsim.radiation.scattering` hold for a slab of infinite width that the line crosses squarely. Of walls
+with the depth t the short way through,
 
-    S(t) (R (1 - a k) c^(q + p t) + k (a + b e^(-f t)))
+    S(t) P(t / n) exp(k (a g + x (b g + v l) + x^2 (c + w l))),  x = t / (1 + t)
 
-photons arrive, S those of the slab. R is the share of the wide wall's scattered photons that come from a wall of this
-size: with h = d d' / (d + d') from the distances of source and detector to the wall's plane, a strip that reaches x to
-one side of the line gives x / sqrt(x^2 + h^2) of that side's (scattering once and isotropically into a small detector:
-1 / (d^2 + x^2) for each place, and for both distances nearly the same with h), and a rectangle the product of two
-strips. k is 1 where the line leads out of a hollow box: its other walls scatter too, photons that go round (a) and
-photons that go back and through this wall (b; softer, so that a thick wall keeps more of them). The exponent is that
-scattered photons take the short way. The five constants (``configs/elements/walls.csv``) are fitted to the Monte Carlo
-of buildings (``experiments/transport/walls.py``).
+photons arrive, S(t) = t exp(g(t) - t) those of the slab. P is the share of the slab's photons that walls of this size,
+shape and place send to the detector, for n walls in turn (`swarmsim.site.surfaces`), linear in ln(t) between
+`swarmsim.site.surfaces.DEPTHS` and constant beyond. k is 1 where the line leads out of a hollow box: photons go to and
+fro inside it before they leave, the more of them the less the material absorbs (g) and the lower their energy is
+(l, its logarithm over 662 keV). A wide wall that is crossed squarely is the slab: P = 1, k = 0.
+
+The constants (``configs/elements/walls.csv``) are fitted to the Monte Carlo of buildings
+(``experiments/transport/walls.py``).
 """
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from swarmsim.config.files import packaged_dir
 from swarmsim.radiation.scattering import DEPTH_MAX, DEPTH_SCALES, POSITIONS
 from swarmsim.site.rays import Crossed
+from swarmsim.site.surfaces import DEPTHS, Constants, constants
 
-
-class Constants(NamedTuple):
-    """See the module."""
-
-    slant: float  # q
-    slant_per_depth: float  # p
-    around: float  # a
-    back: float  # b
-    back_per_depth: float  # f
+REFERENCE_KEV = 662.0
 
 
 class Scattered(NamedTuple):
@@ -45,20 +37,16 @@ class Scattered(NamedTuple):
     slant: jax.Array  # [..., L] their sum
     counts: jax.Array  # [..., L]
     by_depth: jax.Array  # [..., L] derivative of the counts by the depth
-    by_slant: jax.Array  # [..., L]
     by_walls: jax.Array  # [..., L] by the part of the depth that is walls, over the depth
 
 
-@lru_cache(maxsize=1)
-def constants() -> Constants:
-    """The constants of the project's table."""
-    text = (packaged_dir() / "elements" / "walls.csv").read_text(encoding="utf-8")
-    rows = [line.split(",") for line in text.splitlines() if not line.startswith("#")][1:]
-    return Constants(**{name: float(value) for name, value in rows})
-
-
 def scattered_counts(
-    attenuation_1_m: jax.Array, scatter_1_m: jax.Array, air: int | None, way: Crossed, k: Constants | None = None
+    attenuation_1_m: jax.Array,
+    scatter_1_m: jax.Array,
+    energy_kev: jax.Array,
+    air: int | None,
+    way: Crossed,
+    k: Constants | None = None,
 ) -> Scattered:
     """What arrives of the photons that matter on the way [..., M] scatters.
 
@@ -70,6 +58,7 @@ def scattered_counts(
     Args:
         attenuation_1_m: [L, M].
         scatter_1_m: [positions, COEFFICIENTS, L, M], see `Detector`.
+        energy_kev: [L] of the lines.
         air: number of the material that is no wall.
         way: what the line crosses.
         k: those of the project's table by default.
@@ -86,26 +75,38 @@ def scattered_counts(
     t = jnp.minimum(depth, DEPTH_MAX)
     growth = c[0] + c[1] * t + c[2] * jnp.log1p(t / DEPTH_SCALES[0]) + c[3] * jnp.log1p(t / DEPTH_SCALES[1])
     steep = c[1] + c[2] / (DEPTH_SCALES[0] + t) + c[3] / (DEPTH_SCALES[1] + t)
-    falling = jnp.exp(growth - depth)
-    rising = 1.0 + depth * (jnp.where(depth < DEPTH_MAX, steep, 0.0) - 1.0)  # of depth x falling, over falling
+    rise = jnp.where(depth < DEPTH_MAX, depth * steep, 0.0)  # of the growth, by ln(depth)
+    rising = 1.0 + rise - depth  # of the logarithm of all, by ln(depth)
     if way.shape is None:
-        zero = jnp.zeros_like(depth)
-        return Scattered(layers, depth, slant_layers, slant, depth * falling, falling * rising, zero, zero)
-    k, small = k or constants(), 1e-9
-    of_walls = 1.0 if air is None else 1.0 - layers[..., air] / (depth + small)
-    missing, other = (1.0 - way.shape.spread)[..., None], way.shape.closed[..., None]
-    narrow, closed = of_walls * missing, of_walls * other
-    cosine = (depth + small) / (slant + small)
-    log_cosine, power = jnp.log(cosine), k.slant + k.slant_per_depth * depth
-    slanted, softened = jnp.exp(power * log_cosine), k.back * jnp.exp(-k.back_per_depth * depth)
-    straight, back = (1.0 - narrow) * (1.0 - k.around * closed) * slanted, closed * softened
-    share = straight + k.around * closed + back
-    of_share = straight * (power + k.slant_per_depth * depth * log_cosine) - k.back_per_depth * depth * back
+        falling = jnp.exp(growth - depth)
+        return Scattered(layers, depth, slant_layers, slant, depth * falling, falling * rising, jnp.zeros_like(depth))
+    k = k or constants()
+    of_walls = 1.0 if air is None else 1.0 - layers[..., air] / (depth + 1e-9)
+    closed, x = way.shape.closed[..., None], depth / (1.0 + depth)
+    level = jnp.log(jnp.maximum(energy_kev, 1.0) / REFERENCE_KEV)
+    linear, curved = k.growth_depth * growth + k.energy * level, k.depth + k.energy_depth * level
+    more = closed * (k.growth * growth + x * (linear + x * curved))
+    rise_of_more = (k.growth + k.growth_depth * x) * rise + x * (1.0 - x) * (linear + 2.0 * x * curved)
+    share, rise_of_share = _shares(way, depth * of_walls)
+    falling = jnp.exp(growth - depth + of_walls * more)
+    seen = 1.0 + of_walls * (share - 1.0)
     # a thicker wall makes up more of the depth
-    by_walls = other * (k.around + softened)
-    by_walls -= slanted * (missing * (1.0 - k.around * closed) + k.around * other * (1.0 - narrow))
-    of_share += (1.0 - of_walls) * by_walls
+    by_walls = share - 1.0 + rise_of_share + seen * more
+    of_share = of_walls * rise_of_share + (1.0 - of_walls) * by_walls
     return Scattered(
-        layers, depth, slant_layers, slant, depth * falling * share,
-        falling * (rising * share + of_share), -falling * straight * power * cosine, falling * by_walls,
+        layers, depth, slant_layers, slant, depth * falling * seen,
+        falling * (seen * (rising + of_walls * closed * rise_of_more) + of_share), falling * by_walls,
     )  # fmt: skip
+
+
+def _shares(way: Crossed, depth: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """P of walls with depths [..., L], and its derivative by ln(depth)."""
+    assert way.shape is not None
+    step = float(np.log(DEPTHS[1] / DEPTHS[0]))
+    at = jnp.log(jnp.maximum(depth / way.shape.walls[..., None], 1e-6) / DEPTHS[0]) / step
+    share = way.shape.share[..., None, :]
+    found, rise = share[..., 0], jnp.zeros_like(at)
+    for number in range(len(DEPTHS) - 1):
+        part, change = jnp.clip(at - number, 0.0, 1.0), share[..., number + 1] - share[..., number]
+        found, rise = found + change * part, rise + jnp.where((part > 0.0) & (part < 1.0), change / step, 0.0)
+    return found, rise

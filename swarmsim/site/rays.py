@@ -12,45 +12,28 @@ from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site, sample
+from swarmsim.site.shapes import (
+    Crossed,
+    Longest,
+    Shape,
+    Way,
+    in_axes,
+    key_of,
+    longest,
+    nothing_crossed,
+    nothing_met,
+    of_both,
+    shaped,
+    stretched,
+    wide,
+)
+from swarmsim.site.surfaces import matter, part_inside, slabs
 from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
 NEIGHBOURS = 16  # segments that are intersected with the same clusters of boxes
+PAIRS = 128  # of a segment and a box, of which shares are computed at a time
 CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
 _TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
-_PARALLEL = 1e-9  # m over the whole segment; a smaller direction component is parallel to the slab
-
-
-@pytree
-class Shape:
-    """What decides how much of the photons that scatter in walls arrives: see `swarmsim.radiation.scattering`."""
-
-    thin_m: jax.Array  # [..., M] length the shortest way through each piece of matter that is crossed; <= length_m
-    spread: jax.Array  # [...] 0..1: part of an infinite wall's scattered photons that come from a wall of its size
-    closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box, whose other walls scatter too
-    ground: jax.Array  # [..., 2] how the ground shines, see `mirrored`
-
-
-@pytree
-class Crossed:
-    """Materials along a segment, in the order of ``Site.material_names``."""
-
-    length_m: jax.Array  # [..., M]
-    place: jax.Array  # [..., M] mean place of the material along the segment, 0 at its start and 1 at its end
-    shape: Shape | None = None  # None: walls are infinitely wide, and crossed squarely
-
-
-def stretched(way: Crossed, factors: jax.Array) -> Crossed:
-    """The same with each material [M] so many times as thick."""
-    shape = None if way.shape is None else replace(way.shape, thin_m=way.shape.thin_m * factors)
-    return replace(way, length_m=way.length_m * factors, shape=shape)
-
-
-def nothing_crossed(n: int, materials: int) -> Crossed:
-    """Of n segments that have no length."""
-    zero, row = jnp.zeros((n, materials)), jnp.zeros(n)
-    return Crossed(
-        length_m=zero, place=zero, shape=Shape(thin_m=zero, spread=row, closed=row, ground=jnp.zeros((n, 2)))
-    )
 
 
 def path_lengths(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
@@ -67,10 +50,14 @@ def crossed(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
     The terrain is crossed exactly too (`swarmsim.site.terrain_crossing`). Lengths are continuous in both ends and
     differentiable almost everywhere; of the rest ``thin_m`` and ``ground`` are, the others are constants to
-    derivatives. Where obstacles overlap, the lengths are scaled so that their sum does not exceed the distance. The
-    remaining distance is that through ``air`` if the table has it, and then the sum equals the distance.
+    derivatives. The ``shape`` knows two boxes, those with the longest short ways; others count as wide walls, and the
+    two do so too as far as a third is as long. Where obstacles overlap, the lengths are scaled so that their sum does
+    not exceed the distance. The remaining distance is that through ``air`` if the table has it, and then the sum equals
+    the distance.
     """
-    return _crossed(site, above_of(site), a, b)
+    way = _way(site, above_of(site), a, b)
+    every = shaped(site.obstacles, a[None], b[None], jax.tree.map(lambda x: x[None], way))
+    return jax.tree.map(lambda x: x[0], every)
 
 
 def above_of(site: Site) -> Ceilings:
@@ -78,7 +65,7 @@ def above_of(site: Site) -> Ceilings:
     return ceilings(site.terrain_m) if site.above is None else site.above
 
 
-def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes | None" = None) -> Crossed:
+def _way(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes | None" = None) -> Way:
     direction = b - a
     distance = _length(direction)
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
@@ -96,10 +83,12 @@ def _crossed(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Bo
     if "air" in site.material_names:
         rest = jnp.where(materials == site.material_names.index("air"), jnp.maximum(1.0 - total, 0.0), 0.0)
         fractions, thin = fractions + rest, thin + rest
-    spread, closed = 1.0 - jnp.sum(found.narrow) / walls, jnp.sum(found.closed) / walls
-    place, spread, closed = jax.lax.stop_gradient((jnp.clip(place, 0.0, 1.0), spread, closed))
-    shape = Shape(thin_m=distance * thin, spread=spread, closed=closed, ground=mirrored(site, a, b))
-    return Crossed(length_m=distance * fractions, place=place, shape=shape)
+    place = jax.lax.stop_gradient(jnp.clip(place, 0.0, 1.0))
+    crossed = Crossed(length_m=distance * fractions, place=place)
+    thin_m, ground = distance * thin, mirrored(site, a, b)
+    return Way(
+        crossed=crossed, thin_m=thin_m, ground=ground, walls_m=jax.lax.stop_gradient(distance * walls), met=found.met
+    )
 
 
 def _length(vector: jax.Array) -> jax.Array:
@@ -135,77 +124,86 @@ def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     once: few segments meet more than one or two.
     """
     n, above, clusters = b.shape[0], above_of(site), _clusters(site.obstacles)
+    every = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), clusters)
+    firsts = jnp.arange(0, every.wall_m.shape[0], CLUSTER)
     size = min(NEIGHBOURS, n)
     ends = jnp.pad(b, [(0, -n % size), (0, 0)], mode="edge").reshape(-1, size, 3)
-    row, one = jnp.zeros((size, len(site.material_names))), jnp.zeros(size)
-    nothing = _Found(share=row, moment=row, thin=row, narrow=one, closed=one)
+    nothing = jax.tree.map(lambda x: jnp.broadcast_to(x, (size, *x.shape)), _nothing_found(len(site.material_names)))
 
-    def block(ends: jax.Array) -> Crossed:
+    def block(ends: jax.Array) -> Way:
         near = jax.lax.map(lambda boxes: jnp.any(_near(boxes, a, ends)), clusters)
         direction = ends - a
         distance = _length(direction)
 
-        def add(found: _Found, cluster: tuple[Obstacles, jax.Array]) -> tuple[_Found, None]:
+        def add(found: _Found, cluster: tuple[Obstacles, jax.Array, jax.Array]) -> tuple[_Found, None]:
             def met(found: _Found) -> _Found:
-                return _met(site, cluster[0], a, direction, distance, found)
+                return _met(site, cluster[0], cluster[2], a, direction, distance, found)
 
             return jax.lax.cond(cluster[1], met, lambda found: found, found), None
 
         def some() -> _Found:
-            return jax.lax.scan(add, nothing, (clusters, near))[0]
+            return jax.lax.scan(add, nothing, (clusters, near, firsts))[0]
 
         found = jax.lax.cond(jnp.any(near), some, lambda: nothing)
-        return jax.vmap(lambda end, own: _crossed(site, above, a, end, lambda *_: own))(ends, found)
+        return jax.vmap(lambda end, own: _way(site, above, a, end, lambda *_: own))(ends, found)
 
-    found = jax.lax.map(block, ends)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], found)
+    ways = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], jax.lax.map(block, ends))
+    return shaped(every, jnp.broadcast_to(a, b.shape), b, ways, PAIRS)
 
 
 def _met(
-    site: Site, boxes: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array, found: "_Found"
+    site: Site,
+    boxes: Obstacles,
+    first: jax.Array,
+    a: jax.Array,
+    direction: jax.Array,
+    distance: jax.Array,
+    found: "_Found",
 ) -> "_Found":
-    """``found`` [n] with what n segments from ``a`` [3] cross of some boxes."""
-    materials, numbers = jnp.arange(len(site.material_names), dtype=jnp.int32), jnp.arange(boxes.wall_m.shape[0])
+    """``found`` [n] with what n segments from ``a`` [3] cross of boxes, the numbers of which begin with ``first``."""
+    numbers = jnp.arange(boxes.wall_m.shape[0], dtype=jnp.int32)
 
     def more(carry: tuple[jax.Array, _Found]) -> jax.Array:
         return jnp.any(carry[0])
 
     def next_(carry: tuple[jax.Array, _Found]) -> tuple[jax.Array, _Found]:
         meets, found = carry
-        number = jnp.argmax(meets, axis=1)
+        number = jnp.argmax(meets, axis=1).astype(jnp.int32)
 
         def one(number: jax.Array, meets: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
             box = jax.tree.map(lambda x: x[number][None], boxes)
-            own = jax.tree.map(lambda x: jnp.where(meets, x[0], 0.0), _of_boxes(box, a, direction, distance))
-            return _by_material(own, box.material[0] == materials)
+            return _of_box(site, box, first + number, a, direction, distance, meets)
 
         own = jax.vmap(one)(number, jnp.any(meets, axis=1), direction, distance)
-        return meets & (numbers != number[:, None]), jax.tree.map(jnp.add, found, own)
+        return meets & (numbers != number[:, None]), _together(found, own)
 
     meets = jax.vmap(lambda d: _meets(boxes, a, d))(direction)
     return jax.lax.while_loop(more, next_, (meets, found))[1]
 
 
-def _by_material(found: "_Found", material: jax.Array) -> "_Found":
-    """What was found of one box [], or of each [1], by ``material`` [M]: whether it is the box's."""
-    share, moment, thin = (jnp.where(material, x, 0.0) for x in (found.share, found.moment, found.thin))
-    return _Found(share=share, moment=moment, thin=thin, narrow=found.narrow, closed=found.closed)
+def _of_box(
+    site: Site,
+    box: Obstacles,
+    number: jax.Array,
+    a: jax.Array,
+    direction: jax.Array,
+    distance: jax.Array,
+    meets: jax.Array | bool = True,
+) -> "_Found":
+    """What a segment crosses of one ``box`` [1]; nothing unless it ``meets`` it."""
+    lengths = [jnp.where(meets, x, 0.0) for x in _of_boxes(box, a, direction, distance)]
+    met = replace(nothing_met(), first=key_of(jax.lax.stop_gradient(lengths[2][0]), number))
+    own = box.material == jnp.arange(len(site.material_names), dtype=jnp.int32)
+    share, moment, thin = (jnp.where(own, x, 0.0) for x in lengths)
+    return _Found(share=share, moment=moment, thin=thin, met=met)
 
 
 def _meets(boxes: Obstacles, a: jax.Array, direction: jax.Array) -> jax.Array:
     """Whether a segment meets each box [K]: those that `_of_boxes` finds something of."""
-    middle, reach = _slabs(boxes, a, direction)
-    (enter, leave), _ = _slab_fraction(middle, reach, [boxes.half_extent_m[:, k] for k in range(3)])
+    start, along = in_axes(boxes, a - boxes.centre_m), in_axes(boxes, direction)
+    first, last = part_inside(*slabs(start, along), [boxes.half_extent_m[:, k] for k in range(3)])
     # what is no number stays so
-    return ~(jnp.minimum(_least(leave), 1.0) <= jnp.maximum(_most(enter), 0.0))
-
-
-def _slabs(boxes: Obstacles, a: jax.Array, direction: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Where [K] a line from ``a`` crosses the middle planes of boxes, and how much of it a metre across them takes."""
-    start, along = _in_axes(boxes, a - boxes.centre_m), _in_axes(boxes, direction)
-    # Clamp a component that is too small to divide by: the slab then extends far beyond the segment.
-    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
-    return [-x * i for x, i in zip(start, inverse, strict=True)], [jnp.abs(i) for i in inverse]
+    return ~(last <= first)
 
 
 def _clusters(boxes: Obstacles) -> Obstacles:
@@ -240,21 +238,10 @@ def _near(boxes: Obstacles, a: jax.Array, ends: jax.Array) -> jax.Array:
     # where it meets the box, at s: (s - share) length <= radius + s around
     last = jnp.where(length > around, (radius + share * length) / jnp.maximum(length - around, 1e-6), 1.0)
     larger = boxes.half_extent_m + (around * jnp.minimum(last, 1.0) + _TOUCH_M)[:, None]
-    start, along = _in_axes(boxes, -offset), _in_axes(boxes, direction)
-    inverse = [1.0 / jnp.where(jnp.abs(d) < _PARALLEL, _PARALLEL, d) for d in along]
-    reach = [jnp.abs(i) * larger[:, k] for k, i in enumerate(inverse)]
-    middles = [-x * i for x, i in zip(start, inverse, strict=True)]
-    enter = jnp.maximum(_most([m - r for m, r in zip(middles, reach, strict=True)]), 0.0)
-    leave = jnp.minimum(_least([m + r for m, r in zip(middles, reach, strict=True)]), 1.0)
+    start, along = in_axes(boxes, -offset), in_axes(boxes, direction)
+    enter, leave = part_inside(*slabs(start, along), [larger[:, k] for k in range(3)])
     # an end that is no number (padding may hold anything) must not hide a box from its neighbours
     return ~(leave < enter) & (radius > 0.0)
-
-
-def _in_axes(boxes: Obstacles, vector: jax.Array) -> list[jax.Array]:
-    """Components [K] of ``vector`` [3] or [K, 3] along the axes of each box."""
-    c, s = boxes.axis[:, 0], boxes.axis[:, 1]
-    x, y, z = (vector[..., k] for k in range(3))
-    return [c * x + s * y, c * y - s * x, jnp.broadcast_to(z, c.shape)]
 
 
 def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = None) -> Crossed:
@@ -267,28 +254,39 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
     nothing, shapes = np.zeros(1, np.float32), above.shapes
     bare = jax.tree.map(lambda _: nothing, site)
 
-    def one(end: jax.Array, start: jax.Array, needed: Any, heights: tuple[jax.Array, jax.Array]) -> Crossed:
+    def one(end: jax.Array, start: jax.Array, needed: Any, heights: tuple[jax.Array, jax.Array]) -> Way:
         boxes, terrain, origin, cell, ground = needed
         here = replace(bare, obstacles=boxes, terrain_m=terrain, origin_m=origin, cell_m=cell, ground_material=ground)
         ceiling = Ceilings(highest_m=heights[0], around_m=heights[1], shapes=shapes)
-        return _crossed(here, ceiling, start, end, _box_after_box)
+        return _way(here, ceiling, start, end, _box_after_box)
 
     starts = jnp.broadcast_to(a, b.shape)
-    found: Crossed = over_vehicles(one, (0, 0, None, None), platform=platform)(
+    ways: Way = over_vehicles(one, (0, 0, None, None), platform=platform)(
         b, starts, needed, (above.highest_m, above.around_m)
     )
-    return found
+    return shaped(site.obstacles, starts, b, ways)
 
 
 @pytree
 class _Found:
-    """What a segment crosses of each box [K], or of the boxes of each material [M]; lengths over the segment's."""
+    """What a segment crosses of the boxes of each material [M]; lengths over the segment's."""
 
     share: jax.Array
     moment: jax.Array  # integral of the place over the part inside
-    thin: jax.Array  # the shortest way through the box's matter
-    narrow: jax.Array  # that, times the missing part of an infinite wall
-    closed: jax.Array  # that, for a box that one end of the segment lies in
+    thin: jax.Array  # the shortest way through each box's matter
+    met: Longest
+
+
+def _nothing_found(materials: int) -> _Found:
+    zero = jnp.zeros(materials)
+    return _Found(share=zero, moment=zero, thin=zero, met=nothing_met())
+
+
+def _together(one: _Found, other: _Found) -> _Found:
+    return _Found(
+        share=one.share + other.share, moment=one.moment + other.moment, thin=one.thin + other.thin,
+        met=of_both(one.met, other.met),
+    )  # fmt: skip
 
 
 Boxes = Callable[[Site, jax.Array, jax.Array, jax.Array], _Found]
@@ -298,11 +296,11 @@ Boxes = Callable[[Site, jax.Array, jax.Array, jax.Array], _Found]
 def _all_boxes(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
     materials = jnp.arange(len(site.material_names), dtype=jnp.int32)
     one_hot = (site.obstacles.material[:, None] == materials).astype(jnp.float32)
+    share, moment, thin = _of_boxes(site.obstacles, a, direction, distance)
     # Matrix product: a masked sum would dominate the cost.
-    found = _of_boxes(site.obstacles, a, direction, distance)
-    stacked = jnp.stack([found.share, jax.lax.stop_gradient(found.moment), found.thin])
-    share, moment, thin = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
-    return _Found(share=share, moment=moment, thin=thin, narrow=found.narrow, closed=found.closed)
+    stacked = jnp.stack([share, jax.lax.stop_gradient(moment), thin])
+    sums = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
+    return _Found(share=sums[0], moment=sums[1], thin=sums[2], met=longest(jax.lax.stop_gradient(thin)))
 
 
 def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
@@ -310,64 +308,21 @@ def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax
 
     def add(k: jax.Array, found: _Found) -> _Found:
         box = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 1), boxes)
-        own = _by_material(_of_boxes(box, a, direction, distance), box.material == materials)
-        return jax.tree.map(jnp.add, found, own)
+        return _together(found, _of_box(site, box, jnp.asarray(k, jnp.int32), a, direction, distance))
 
-    zero, one = jnp.zeros(materials.shape), jnp.zeros(1)
-    nothing = _Found(share=zero, moment=zero, thin=zero, narrow=one, closed=one)
-    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, nothing)
+    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, _nothing_found(materials.shape[0]))
 
 
-def _of_boxes(obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
-    """What the segment crosses of each box [K]. Written per component, so that the boxes are the vectorised axis."""
-    start, along = _in_axes(obstacles, a - obstacles.centre_m), _in_axes(obstacles, direction)
-    middle, reach = _slabs(obstacles, a, direction)
-    outer = [obstacles.half_extent_m[:, k] for k in range(3)]
-    inner = [half - obstacles.wall_m for half in outer]
-    hollow = (obstacles.wall_m > 0.0) & (_least(inner) > 0.0)
-    (enter, leave), (whole, of_whole) = _slab_fraction(middle, reach, outer)
-    _, (empty, of_empty) = _slab_fraction(middle, reach, inner)
-    share = whole - jnp.where(hollow, empty, 0.0)
-    moment = of_whole - jnp.where(hollow, of_empty, 0.0)
-    first, last = _most(enter), _least(leave)
-    within = (first < 0.0) != (last > 1.0)
-    shortest = jnp.where(hollow, jnp.where(within, 1.0, 2.0) * obstacles.wall_m, 2.0 * _least(outer))
-    thin = jnp.minimum(share, shortest / jnp.maximum(distance, 1e-9))
-    # The face that the segment leaves the box by, or enters it by if it ends inside, and how far its edges are
-    at = jnp.where(last < 1.0, last, first)
-    faces = [jnp.where(last < 1.0, leave[k], enter[k]) == at for k in (0, 1)]
-    place = [x + at * d for x, d in zip(start, along, strict=True)]
-    (one, other), (wide, high) = (
-        (jnp.where(faces[0], x[1], x[0]), jnp.where(faces[0] | faces[1], x[2], x[1])) for x in (place, outer)
-    )
-    per_share = 1.0 / jnp.maximum(share, 1e-9)
-    mean = moment * per_share
-    scale = jnp.square(distance * thin * per_share * mean * (1.0 - mean)) + 1e-12
-    missing = 1.0 - _seen(one, wide, scale) * _seen(other, high, scale)
-    closed = jnp.where(hollow & within, thin, 0.0)
-    return _Found(share=share, moment=moment, thin=thin, narrow=thin * missing, closed=closed)
+def _of_boxes(
+    obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`matter` of each box [K]. Written per component, so that the boxes are the vectorised axis."""
+    start, along = in_axes(obstacles, a - obstacles.centre_m), in_axes(obstacles, direction)
+    half = [obstacles.half_extent_m[:, k] for k in range(3)]
+    return matter(start, along, half, obstacles.wall_m, distance)
 
 
-def _seen(place: jax.Array, half: jax.Array, scale2: jax.Array) -> jax.Array:
-    """Part [K] of an infinite wall's scattered photons from a strip of it, -/+ ``half`` wide, around ``place``."""
-    ahead, behind = half - place, half + place
-    return 0.5 * (ahead * jax.lax.rsqrt(ahead * ahead + scale2) + behind * jax.lax.rsqrt(behind * behind + scale2))
-
-
-def _most(x: list[jax.Array]) -> jax.Array:
-    return jnp.maximum(jnp.maximum(x[0], x[1]), x[2])
-
-
-def _least(x: list[jax.Array]) -> jax.Array:
-    return jnp.minimum(jnp.minimum(x[0], x[1]), x[2])
-
-
-def _slab_fraction(
-    middle: list[jax.Array], reach: list[jax.Array], half: list[jax.Array]
-) -> tuple[tuple[list[jax.Array], list[jax.Array]], tuple[jax.Array, jax.Array]]:
-    """Where lines enter and leave slabs at middle -/+ reach half; the share [K] of 0 <= t <= 1 in all, its moment."""
-    enter = [m - r * h for m, r, h in zip(middle, reach, half, strict=True)]
-    leave = [m + r * h for m, r, h in zip(middle, reach, half, strict=True)]
-    first, last = jnp.maximum(_most(enter), 0.0), jnp.minimum(_least(leave), 1.0)
-    share = jnp.maximum(last - first, 0.0)
-    return (enter, leave), (share, share * 0.5 * (jnp.minimum(first, 1.0) + jnp.maximum(last, 0.0)))
+__all__ = [
+    "Crossed", "Shape", "above_of", "by_threads", "crossed", "crossed_from", "mirrored", "nothing_crossed",
+    "path_lengths", "stretched", "wide",
+]  # fmt: skip

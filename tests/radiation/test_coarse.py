@@ -12,7 +12,8 @@ from swarmsim.radiation.coarse import coarse
 from swarmsim.radiation.detector import Source
 from swarmsim.radiation.rate import roi_rates, roi_rates_and_slopes
 from swarmsim.site import Crossed
-from swarmsim.site.rays import Shape, stretched
+from swarmsim.site.rays import Shape, stretched, wide
+from swarmsim.site.surfaces import DEPTHS
 
 Detectors = dict[tuple[str, str], Detector]
 MATERIALS = ("air", "concrete", "steel")
@@ -33,7 +34,8 @@ def ways(detector: Detector, seed: int, count: int, walls: float = 0.3) -> tuple
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     shape = Shape(
         thin_m=f32(length * np.where(rng.random(length.shape) < 0.5, 1.0, rng.uniform(0.3, 1.0, length.shape))),
-        spread=f32(rng.uniform(0.1, 1.0, count)), closed=f32(rng.integers(2, size=count)),
+        share=f32(rng.uniform(0.1, 1.0, (count, len(DEPTHS)))), closed=f32(rng.integers(2, size=count)),
+        walls=f32(rng.uniform(1.0, 2.0, count)),
         ground=f32(np.sort(rng.uniform(0.0, 1.0, (count, 2)))[:, ::-1]),
     )  # fmt: skip
     return Crossed(length_m=f32(length), place=f32(between), shape=shape), f32(place), f32(axis)
@@ -80,8 +82,7 @@ def test_rates_with_slopes_are_the_rates_and_slopes_their_differences(
 def test_a_way_without_a_shape_has_wide_walls_and_no_ground(detectors: Detectors) -> None:
     d = detectors["nai_1p5x1p5", "physical"]
     way, place, axis = ways(d, 5, 6)
-    ones = jnp.ones(6)
-    shape = Shape(thin_m=way.length_m, spread=ones, closed=0.0 * ones, ground=jnp.zeros((6, 2)))
+    shape = wide(way.length_m, jnp.zeros((6, 2)))
     columns = tuple(d.material_names.index(name) for name in ("air", "concrete"))
     found, expected = (
         _with_slopes(d, source(0), replace(way, shape=each), place, axis, by=columns) for each in (None, shape)

@@ -10,6 +10,7 @@ from yards import MATERIALS, make_site
 
 from swarmsim.site import crossed, path_lengths
 from swarmsim.site.rays import by_threads, crossed_from
+from swarmsim.site.surfaces import DEPTHS
 
 CONCRETE = MATERIALS.index("concrete")
 lengths_of, crossed_of = jax.jit(path_lengths), jax.jit(crossed)
@@ -179,11 +180,11 @@ def test_a_thread_for_each_segment_crosses_the_same():
     np.testing.assert_allclose(found.length_m, expected.length_m, atol=1e-4)
     np.testing.assert_allclose(found.place, expected.place, atol=1e-4)
     one_by_one = jax.jit(jax.vmap(lambda a: jax.vmap(lambda b: crossed(site, a, b))(ends)))(starts)
-    for name in ("thin_m", "spread", "closed", "ground"):
+    for name in ("thin_m", "share", "closed", "walls", "ground"):
         for other in (found, one_by_one):
             np.testing.assert_allclose(getattr(other.shape, name), getattr(expected.shape, name), atol=2e-4)
     assert float(expected.length_m.max()) > 5.0
-    assert 0.0 <= float(expected.shape.spread.min()) < 0.5
+    assert 0.0 <= float(expected.shape.share.min()) < 0.5
 
 
 @pytest.mark.parametrize("together", ["on lines", "anywhere"])
@@ -240,17 +241,19 @@ def shape_of(site, a, b):
 
 
 def test_the_short_way_through_a_wall_and_what_is_seen_of_it():
-    """A wall 0.2 m thick and 12 m long across the middle of a line of 10 m: h is 2.5 m, times the cosine."""
-    site = make_site([((0.0, 0.0, 0.0), (0.1, 6.0, 200.0), 0.0, 0.0, "concrete")])
+    """A wall 0.2 m thick across the middle of a line of 10 m; wide, then ending where the line crosses it."""
+    site = make_site([((0.0, 0.0, 0.0), (0.1, 200.0, 200.0), 0.0, 0.0, "concrete")])
     length, thin, shape = shape_of(site, (-5, 0, 0), (5, 0, 0))
     assert (length, thin) == (pytest.approx(0.2, rel=1e-4), pytest.approx(0.2, rel=1e-4))
-    assert float(shape.spread) == pytest.approx(6.0 / np.hypot(6.0, 2.5), rel=2e-3)
-    assert float(shape.closed) == 0.0
-    length, thin, shape = shape_of(site, (-3, 4, 0), (3, -4, 0))  # at 53 degrees
+    np.testing.assert_allclose(shape.share, 1.0, atol=0.02)
+    assert (float(shape.closed), float(shape.walls)) == (0.0, 1.0)
+    length, thin, oblique = shape_of(site, (-3, 4, 0), (3, -4, 0))  # at 53 degrees
     assert (length, thin) == (pytest.approx(1 / 3, rel=1e-4), pytest.approx(0.2, rel=1e-3))
-    edges = [x / np.hypot(x, 1.5) for x in (5.87, 6.13)]
-    assert float(shape.spread) == pytest.approx(np.mean(edges), rel=2e-3)
-    assert float(shape_of(site, (-5, 5.9, 0), (5, 5.9, 0))[2].spread) == pytest.approx(0.5 * (0.04 + 0.979), rel=0.01)
+    assert np.all(np.diff(oblique.share) < 0.0)  # the thicker it is, the less comes through at an angle
+    assert float(oblique.share[-1]) < 0.5
+    ends = [shape_of(site, (-5, y, 0), (5, y, 0))[2].share for y in (199.99, 190.0)]
+    np.testing.assert_allclose(ends[0], 0.5, atol=0.02)
+    np.testing.assert_allclose(ends[1], 1.0, atol=0.05)
 
 
 def test_a_line_out_of_a_building_knows_that_it_is_closed():
@@ -261,11 +264,12 @@ def test_a_line_out_of_a_building_knows_that_it_is_closed():
         assert length > 0.2
         assert thin == pytest.approx(0.2, rel=1e-3)
         assert float(shape.closed) == pytest.approx(1.0, rel=1e-4)
+        assert float(shape.walls) == pytest.approx(1.0, rel=1e-4)
     _, thin, shape = shape_of(site, behind, (20.0, 2.0, 5.0))
     assert thin == pytest.approx(0.4, rel=1e-3)
-    assert float(shape.closed) == 0.0
+    assert (float(shape.closed), float(shape.walls)) == (0.0, pytest.approx(2.0, rel=1e-4))
     _, _, shape = shape_of(site, (0.0, 20.0, 5.0), (20.0, 20.0, 5.0))
-    assert (float(shape.spread), float(shape.closed)) == (1.0, 0.0)
+    assert (shape.share.tolist(), float(shape.closed), float(shape.walls)) == ([1.0] * len(DEPTHS), 0.0, 1.0)
 
 
 def test_the_mirror_image_of_the_ground():

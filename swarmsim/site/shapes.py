@@ -1,0 +1,167 @@
+"""What decides how walls scatter photons along a segment: its two boxes with the longest short ways.
+
+`swarmsim.site.rays` finds them; `shaped` computes what they scatter (`swarmsim.site.surfaces`), for those segments
+alone that meet any.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.pytree import pytree
+from swarmsim.site.model import Obstacles
+from swarmsim.site.surfaces import DEPTHS, Box, scattered_share, thin_m_of
+
+_UPPER = -(1 << 16)  # mask of a number's upper half
+
+
+@pytree
+class Shape:
+    """What decides how much of the photons that scatter in walls arrives: see `swarmsim.radiation.walls`."""
+
+    thin_m: jax.Array  # [..., M] length the shortest way through each piece of matter that is crossed; <= length_m
+    share: jax.Array  # [..., DEPTHS] photons that walls scatter, over those of infinite walls crossed squarely
+    closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box
+    walls: jax.Array  # [...] 1..2: walls of a box that are crossed in turn
+    ground: jax.Array  # [..., 2] how the ground shines, see `mirrored`
+
+
+@pytree
+class Crossed:
+    """Materials along a segment, in the order of ``Site.material_names``."""
+
+    length_m: jax.Array  # [..., M]
+    place: jax.Array  # [..., M] mean place of the material along the segment, 0 at its start and 1 at its end
+    shape: Shape | None = None  # None: walls are infinitely wide, and crossed squarely
+
+
+def stretched(way: Crossed, factors: jax.Array) -> Crossed:
+    """The same with each material [M] so many times as thick."""
+    shape = None if way.shape is None else replace(way.shape, thin_m=way.shape.thin_m * factors)
+    return replace(way, length_m=way.length_m * factors, shape=shape)
+
+
+def nothing_crossed(n: int, materials: int) -> Crossed:
+    """Of n segments that have no length."""
+    zero = jnp.zeros((n, materials))
+    return Crossed(length_m=zero, place=zero, shape=wide(zero, jnp.zeros((n, 2))))
+
+
+def wide(thin_m: jax.Array, ground: jax.Array) -> Shape:
+    """That of infinite walls crossed squarely: ``thin_m`` [..., M], ``ground`` [..., 2]."""
+    one = jnp.ones(thin_m.shape[:-1])
+    return Shape(
+        thin_m=thin_m, share=jnp.ones((*one.shape, len(DEPTHS))), closed=jnp.zeros_like(one), walls=one, ground=ground
+    )
+
+
+@pytree
+class Longest:
+    """The three boxes with the longest short ways, for segments [...]: see `key_of`; 0 for none."""
+
+    first: jax.Array  # [...] int32
+    second: jax.Array
+    third: jax.Array
+
+
+def key_of(thin: jax.Array, number: jax.Array) -> jax.Array:
+    """A number that grows with ``thin`` [...] >= 0 to 1 %, and holds the box's ``number`` in its lower half."""
+    bits = jax.lax.bitcast_convert_type(thin, jnp.int32)  # it grows with the value
+    return jnp.where(thin > 0.0, (bits & _UPPER) | number, 0)
+
+
+def of_both(one: Longest, other: Longest) -> Longest:
+    """The same of the boxes of either."""
+    lower, seconds = jnp.minimum(one.first, other.first), jnp.maximum(one.second, other.second)
+    rest = jnp.maximum(jnp.minimum(lower, seconds), jnp.minimum(one.second, other.second))
+    return Longest(
+        first=jnp.maximum(one.first, other.first),
+        second=jnp.maximum(lower, seconds),
+        third=jnp.maximum(rest, jnp.maximum(one.third, other.third)),
+    )
+
+
+def nothing_met() -> Longest:
+    """Of a segment that meets no box."""
+    none = jnp.zeros((), jnp.int32)
+    return Longest(first=none, second=none, third=none)
+
+
+@pytree
+class Way:
+    """What is known of a segment before its `Shape`."""
+
+    crossed: Crossed  # without a shape
+    thin_m: jax.Array  # [M]
+    ground: jax.Array  # [2]
+    walls_m: jax.Array  # [] length the short way in all but air
+    met: Longest
+
+
+def shaped(boxes: Obstacles, a: jax.Array, b: jax.Array, way: Way, size: int | None = None) -> Crossed:
+    """``way`` [n] from ``a`` [n, 3] to ``b`` [n, 3] with its shape.
+
+    With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together.
+    """
+    a, b, n = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b), b.shape[0]
+    keys = jnp.concatenate([way.met.first, way.met.second])
+    # the third's, longer by what two keys may differ without being in order
+    third = jax.lax.cond(
+        jnp.any(way.met.third > 0),
+        lambda: jnp.where(way.met.third > 0, 1.02 * thin_m_of(_box(boxes, way.met.third, a, b)), 0.0),
+        lambda: jnp.zeros(n),
+    )
+
+    def of(pair: jax.Array) -> jax.Array:
+        """Length the short way, share less 1, closed, and walls less 1 [DEPTHS + 3, k] of pairs [k]."""
+        row = pair % n
+        found = scattered_share(_box(boxes, keys[pair], a[row], b[row]))
+        return jnp.stack([found.thin_m, *(x - 1.0 for x in found.share), found.closed, found.walls - 1.0])
+
+    each = (of(jnp.arange(2 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 2, n)
+    weight = jnp.where(keys.reshape(2, n) > 0, jnp.maximum(each[0] - third, 0.0), 0.0) / jnp.maximum(way.walls_m, 1e-9)
+    more = [jnp.sum(jnp.where(weight > 0.0, weight * x, 0.0), axis=0) for x in each[1:]]
+    share = 1.0 + jnp.stack(more[:-2], axis=-1)
+    shape = Shape(thin_m=way.thin_m, share=share, closed=more[-2], walls=1.0 + more[-1], ground=way.ground)
+    return replace(way.crossed, shape=shape)
+
+
+def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int) -> jax.Array:
+    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; of the others anything."""
+    n, place = wanted.shape[0], jnp.cumsum(wanted.astype(jnp.int32)) - 1
+    size = min(size, n)
+    rows = jnp.zeros(n + size, jnp.int32).at[jnp.where(wanted, place, n + size)].set(jnp.arange(n), mode="drop")
+    found = jnp.zeros((len(DEPTHS) + 3, n + size))
+
+    def step(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        first, found = carry
+        own = function(jax.lax.dynamic_slice(rows, (first,), (size,)))
+        return first + size, jax.lax.dynamic_update_slice(found, own, (jnp.zeros_like(first), first))
+
+    _, found = jax.lax.while_loop(lambda carry: carry[0] <= place[-1], step, (jnp.zeros((), jnp.int32), found))
+    return found[:, jnp.maximum(place, 0)]
+
+
+def _box(boxes: Obstacles, key: jax.Array, a: jax.Array, b: jax.Array) -> Box:
+    """The boxes of these keys [n], with segments from ``a`` [n, 3] to ``b`` [n, 3]."""
+    own = jax.tree.map(lambda x: jnp.take(x, key & ~_UPPER, axis=0, mode="clip"), boxes)
+    start, end = (in_axes(own, x - own.centre_m) for x in (a, b))
+    return Box(start, end, [own.half_extent_m[:, k] for k in range(3)], own.wall_m)
+
+
+def longest(thin: jax.Array) -> Longest:
+    """Those of boxes with short ways ``thin`` [K]."""
+    key = key_of(thin, jnp.arange(thin.shape[0], dtype=jnp.int32))
+    most = jnp.max(key)
+    rest = jnp.where(key == most, 0, key)
+    second = jnp.max(rest)
+    return Longest(first=most, second=second, third=jnp.max(jnp.where(rest == second, 0, rest)))
+
+
+def in_axes(boxes: Obstacles, vector: jax.Array) -> list[jax.Array]:
+    """Components [K] of ``vector`` [3] or [K, 3] along the axes of each box."""
+    c, s = boxes.axis[:, 0], boxes.axis[:, 1]
+    x, y, z = (vector[..., k] for k in range(3))
+    return [c * x + s * y, c * y - s * x, jnp.broadcast_to(z, c.shape)]

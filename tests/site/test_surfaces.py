@@ -1,0 +1,97 @@
+"""What one box scatters: limits, symmetries, continuity, and floats that could fail."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.site.surfaces import Box, scattered_share
+
+HOUSE, WALL_M = (5.0, 4.0, 2.0), 0.2
+
+
+@jax.jit
+def _shares(start, end, half, wall):
+    columns = [[x[:, k] for k in range(3)] for x in (start, end, half)]
+    found = scattered_share(Box(*columns, wall))
+    return jnp.stack(found.share), found.closed, found.walls, found.thin_m
+
+
+def shares(start, end, half=HOUSE, wall=WALL_M):
+    """Of lines [n, 3] to [n, 3], or of one."""
+    start, end = (np.atleast_2d(np.asarray(x, np.float32)) for x in (start, end))
+    n = max(len(start), len(end))
+    rows = [np.broadcast_to(x, (n, 3)) for x in (start, end, np.asarray(half, np.float32))]
+    return [np.asarray(x) for x in _shares(*rows, np.full(n, wall, np.float32))]
+
+
+@pytest.mark.parametrize("near", [0.5, 2.0, 5.0, 9.0])
+def test_an_infinite_wall_that_is_crossed_squarely_is_the_slab(near):
+    share, closed, walls, thin = shares((-near, 3.0, 1.0), (10.0 - near, 3.0, 1.0), (0.1, 3e3, 3e3), 0.0)
+    np.testing.assert_allclose(share, 1.0, atol=0.02)
+    assert (closed[0], walls[0]) == (0.0, 1.0)
+    assert thin[0] == pytest.approx(0.2, rel=1e-4)
+
+
+def test_the_axes_of_a_box_are_alike():
+    rng = np.random.default_rng(1)
+    start, end = rng.uniform(-1.8, 1.8, (20, 3)), rng.normal(0.0, 20.0, (20, 3))
+    expected = shares(start, end)[0]
+    for order in ([1, 2, 0], [2, 1, 0]):
+        found = shares(start[:, order], end[:, order], np.array(HOUSE)[order])[0]
+        np.testing.assert_allclose(found, expected, rtol=2e-3)
+    mirrored = shares(start * (-1, 1, 1), end * (-1, 1, 1))[0]
+    np.testing.assert_allclose(mirrored, expected, rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("first", "last"),
+    [
+        ((1.0, 0.5, 0.0), (30.0, 6.0, 1.0)),  # from beyond one wall,
+        ((1.0, 0.5, 0.0), (-30.0, 3.0, 9.0)),
+        ((-4.0, 3.5, -1.5), (6.0, 8.0, 6.0)),
+        ((-20.0, 1.0, 0.5), (12.0, 3.0, -0.5)),  # through the whole house
+    ],
+)
+def test_shares_are_continuous_around_a_house(first, last):
+    """Along circles of the detector that cross the planes of all faces, and the line all edges."""
+    middle, radius = np.array([0.0, 0.0, 0.0]), float(np.linalg.norm(last))
+    angle = np.linspace(0.0, 2.0 * np.pi, 8001)
+    for tilt in (0.0, 0.7, 1.4):
+        ring = np.stack([np.cos(angle), np.sin(angle) * np.cos(tilt), np.sin(angle) * np.sin(tilt)], axis=1)
+        share, _, _, thin = shares(first, middle + radius * ring)
+        met = thin > 1e-3
+        both = met[1:] & met[:-1]
+        assert np.isfinite(share[:, met]).all()
+        assert (share[:, met] >= 0.0).all()
+        assert np.max(np.abs(np.diff(share, axis=1))[:, both]) < 0.03
+
+
+def test_a_source_that_leaves_through_a_wall_changes_nothing_at_once():
+    """From the inside of the house to 2 m behind its wall, seen from the other side."""
+    place = np.stack([np.linspace(-4.0, -7.0, 30_001), np.full(30_001, 0.4), np.full(30_001, 0.2)], axis=1)
+    share, closed, walls, thin = shares(place, (25.0, 1.0, 0.5))
+    for each in (*share, closed, walls, thin / WALL_M):
+        assert np.max(np.abs(np.diff(each))) < 0.02
+    assert (closed[0], walls[0], closed[-1], walls[-1]) == (1.0, 1.0, 0.0, 2.0)
+
+
+def test_smaller_walls_scatter_less():
+    size = np.array([0.5, 1.0, 2.0, 4.0, 20.0])
+    found = np.stack([shares((-3.0, 0, 0), (6.0, 0, 0), (0.1, s, s), 0.0)[0][:, 0] for s in size])
+    assert np.all(np.diff(found, axis=0) > 0.0)
+    assert found[0].max() < 0.3
+    assert found[-1].min() > 0.9
+
+
+PLACES = [
+    (0.0, 0.0, 0.0), (5.0, 4.0, 2.0), (4.8, 0.0, 0.0), (4.8, 3.8, 1.8), (4.9, 0.0, 0.0), (5.0, 9.0, 0.0),
+    (-1e5, 3.0, 1.9), (0.0, 0.0, 1e4), (1e-8, -1e-8, 2.0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("half", "wall"), [(HOUSE, 0.2), (HOUSE, 0.0), ((0, 0, 0), 0.0), ((0.05, 9.0, 9.0), 1e-3)])
+def test_no_place_gives_no_number(half, wall):
+    pairs = np.array([(a, b) for a in PLACES for b in PLACES], np.float32)
+    for found in shares(pairs[:, 0], pairs[:, 1], half, wall):
+        assert np.isfinite(found).all()
