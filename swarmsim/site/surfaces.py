@@ -38,7 +38,7 @@ AWAY = 1
 """Of the other faces."""
 PARALLEL_M = 1e-9  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
-_LEAST_COSINE = 0.01
+_LEAST_COSINE = 1e-3
 
 
 class Constants(NamedTuple):
@@ -174,8 +174,8 @@ def scattered_share(box: Box, k: Constants | None = None) -> Shares:
         one = sum(_sum(jnp.where(x, s[t], 0.0)) for x, s in zip(opposite, seen, strict=True))
         other = sum(_sum(jnp.where(x, 0.0, s[t])) for x, s in zip(opposite, seen, strict=True))
         found.append((one * jnp.exp(of_through) + other * jnp.exp(of_returned)) / wide[t])
-    # an end within the matter of a solid box: as a slab
-    among = jnp.where(hollow, 1.0, ends[0] * ends[1])
+    # an end within matter: as a slab, of a hollow box the more so the nearer it is to the middle of the wall
+    among = jnp.where(hollow, jnp.abs((2.0 * ends[0] - 1.0) * (2.0 * ends[1] - 1.0)), ends[0] * ends[1])
     shares = jax.lax.optimization_barrier([1.0 + among * (s - 1.0) for s in found])
     return Shares(share=shares, closed=inside, walls=jnp.where(hollow, walls, 1.0), thin_m=thin * distance)
 
@@ -209,8 +209,8 @@ def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Face
     inverse = [1.0 / jnp.maximum(jnp.square(h * h), 1e-12) for h in box.half]
     total = inverse[0] + inverse[1] + inverse[2]
     edge = jnp.where(hollow, 0.5 * box.wall_m, 0.0)
-    squared = sum(jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True))
-    found = []
+    x, y, z = (jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True))
+    squared, found = x + y + z, []
     for sign in (1.0, -1.0):
         rows = []
         for axis in range(3):
@@ -241,8 +241,10 @@ def _seen(faces: _Faces, nodes_of_edge: int, k: Constants) -> list[jax.Array]:
         far += jnp.square(jnp.maximum(jnp.maximum(low - foot, foot - high), 0.0))
     h = k.width * jnp.sqrt(near * far) / (jnp.sqrt(near) + jnp.sqrt(far))
     part = near / (near + far)
+    # a face that is seen from one side has one place, whichever way the line runs
+    apart = jnp.where(faces.opposite, 1.0, 0.0)
     along, across = (
-        _along(low, high, foot * part, h, nodes_of_edge) for low, high, foot in zip(*faces[2:5], strict=True)
+        _along(low, high, foot * part, h, nodes_of_edge, apart) for low, high, foot in zip(*faces[2:5], strict=True)
     )
     scale = faces.weight * faces.squared * (1.0 / (2.0 * np.pi))
     along, across, scale = jax.lax.optimization_barrier((along, across, scale))
@@ -277,14 +279,14 @@ class _Node(NamedTuple):
 
 
 def _along(
-    low: jax.Array, high: jax.Array, middle: jax.Array, h: jax.Array, nodes: int
+    low: jax.Array, high: jax.Array, middle: jax.Array, h: jax.Array, nodes: int, apart: jax.Array | float = 1.0
 ) -> list[tuple[jax.Array, jax.Array]]:
-    """Places along one edge, and their weights."""
+    """Places along one edge, and their weights; with ``apart`` 0 all in the middle."""
     first, last = low - middle, high - middle
     first, last = (x * jax.lax.rsqrt(x * x + h * h) for x in (first, last))
     half, centre, found = 0.5 * (last - first), 0.5 * (first + last), []
     for node, weight in zip(*np.polynomial.legendre.leggauss(nodes), strict=True):
-        u = centre + float(node) * half
+        u = centre + float(node) * apart * half
         root = jax.lax.rsqrt(jnp.maximum(1.0 - u * u, 1e-9))
         found.append((middle + h * u * root, float(weight) * half * h * root * root * root))
     return found
