@@ -52,8 +52,8 @@ def scattered_counts(
 
     Behind several layers with depths t_k it is that of the depth sum(t_k), with coefficients averaged over the layers
     with weights t_k; each layer's lie between those of a wall near the source and of one half way. Derivatives leave
-    out that these weights change, and take what changes for a wall: for
-    air, ``by_walls`` is to be taken off ``by_depth``.
+    out that the weights of walls among each other change, and take what changes for a wall: for air, ``by_walls`` is to
+    be taken off ``by_depth``.
 
     Args:
         attenuation_1_m: [L, M].
@@ -73,15 +73,23 @@ def scattered_counts(
     mean = jnp.einsum("pclm,...pm->...cl", scatter_1_m, lengths) / (depth + 1e-9)[..., None, :]
     c = [mean[..., k, :] for k in range(mean.shape[-2])]
     t = jnp.minimum(depth, DEPTH_MAX)
-    growth = c[0] + c[1] * t + c[2] * jnp.log1p(t / DEPTH_SCALES[0]) + c[3] * jnp.log1p(t / DEPTH_SCALES[1])
+    logs = [jnp.log1p(t / scale) for scale in DEPTH_SCALES]
+    growth = c[0] + c[1] * t + c[2] * logs[0] + c[3] * logs[1]
     steep = c[1] + c[2] / (DEPTH_SCALES[0] + t) + c[3] / (DEPTH_SCALES[1] + t)
     rise = jnp.where(depth < DEPTH_MAX, depth * steep, 0.0)  # of the growth, by ln(depth)
     rising = 1.0 + rise - depth  # of the logarithm of all, by ln(depth)
+    of_walls, mixed = jnp.ones_like(depth), jnp.zeros_like(depth)  # the growth's derivative by the part that is walls
+    if air is not None:
+        of_walls = 1.0 - layers[..., air] / (depth + 1e-9)
+        p = scatter_1_m[..., air] / attenuation_1_m[:, air]  # [positions, COEFFICIENTS, L]
+        q = [near[..., air, None] * p[0, j] + (1.0 - near[..., air, None]) * p[1, j] for j in range(p.shape[1])]
+        apart = growth - (q[0] + q[1] * t + q[2] * logs[0] + q[3] * logs[1])
+        mixed = jnp.where(of_walls > 1e-3, apart / jnp.maximum(of_walls, 1e-3), 0.0)
     if way.shape is None:
         falling = jnp.exp(growth - depth)
-        return Scattered(layers, depth, slant_layers, slant, depth * falling, falling * rising, jnp.zeros_like(depth))
+        by_depth = falling * (rising + (1.0 - of_walls) * mixed)
+        return Scattered(layers, depth, slant_layers, slant, depth * falling, by_depth, falling * mixed)
     k = k or constants()
-    of_walls = 1.0 if air is None else 1.0 - layers[..., air] / (depth + 1e-9)
     closed, x = way.shape.closed[..., None], depth / (1.0 + depth)
     level = jnp.log(jnp.maximum(energy_kev, 1.0) / REFERENCE_KEV)
     linear, curved = k.growth_depth * growth + k.energy * level, k.depth + k.energy_depth * level
@@ -91,7 +99,8 @@ def scattered_counts(
     falling = jnp.exp(growth - depth + of_walls * more)
     seen = 1.0 + of_walls * (share - 1.0)
     # a thicker wall makes up more of the depth
-    by_walls = share - 1.0 + rise_of_share + seen * more
+    mixed *= 1.0 + of_walls * closed * (k.growth + k.growth_depth * x)
+    by_walls = share - 1.0 + rise_of_share + seen * (more + mixed)
     of_share = of_walls * rise_of_share + (1.0 - of_walls) * by_walls
     return Scattered(
         layers, depth, slant_layers, slant, depth * falling * seen,

@@ -8,15 +8,18 @@ is its middle plane, of each axis as far as the box is thin along it. A place of
 photons, with d, d' the distances of source and detector, c, c' the cosines there, and cos that of the angle between the
 ways to and from it. F is what scatters once and is not lost on its way through the wall, of depth t,
 
-    (e^(-t / c) - e^(-g t / c')) / (g t / c' - t / c)              to the other side (m = M_t c^2 c')
-    b (1 - e^(-t / c - g t / c')) / (t / c + g t / c')             back (m = N_t c c')
+    (e^(-t / c) - e^(-g t / c')) / (g t / c' - t / c)         to the other side
+    b (1 - e^(-t / c - g t / c')) / (t / c + g t / c')        back
 
-g and b being for the photons' lower energy; the rest scatters more often. The integral over the face is taken at
-`NODES` x `NODES` places, Gauss-Legendre's in u = (x - x0) / sqrt((x - x0)^2 + h^2) along each edge, with x0 and h the
-place and the width of the part of the plane that contributes most. The sum over the faces is divided by that of an
-infinite wall between the same two distances. What comes back from the other walls of a box passes one more on its way:
-it is e^(-f t (1 + s o / (1 + o))), o being the line's metres in the wall over its thickness, less 1. All of this is
-computed for walls of `DEPTHS`, and is interpolated between by the depth that a line has (`swarmsim.radiation.walls`).
+g and b being for the photons' lower energy. Photons that scatter more often are in the constants, and m = M c^2 c' of
+them come through the deepest of `DEPTHS` where the line itself does not. The integral over a face between source and
+detector is taken at `NODES` x `NODES` places, Gauss-Legendre's in u = (x - x0) / sqrt((x - x0)^2 + h^2) on each edge,
+with x0 and h the place and the width of the part of the plane that contributes most; of the other faces one place does.
+The sum over the faces is divided by that of an infinite wall between the same two distances. What comes back from the
+other walls of a box passes one more on its way: it is multiplied by e^(-f t (1 + s o / (1 + o))), o being the line's
+metres in the wall over its thickness, less 1; what comes through both walls of a box between source and detector by
+e^(-l t o / (1 + k o)). All of this is computed for walls of `DEPTHS`, and `swarmsim.radiation.walls` interpolates by
+the depth that a line has.
 
 Constants are those of ``configs/elements/walls.csv``, fitted to the Monte Carlo by ``experiments/transport/walls.py``.
 """
@@ -33,16 +36,16 @@ from swarmsim.config.files import packaged_dir
 DEPTHS = (0.25, 0.75, 2.25, 6.75)
 """Depths of a wall in mean free paths, each three times the one before."""
 NODES = 2
-"""Of each edge of a face towards the detector."""
+"""Places along each edge of a face towards the detector."""
 AWAY = 1
-"""Of the other faces."""
+"""The same of the other faces."""
 PARALLEL_M = 1e-9  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
-_LEAST_COSINE = 0.01
+_LEAST_COSINE = 1e-3
 
 
 class Constants(NamedTuple):
-    """Of this module, and from ``energy_0`` on of `swarmsim.radiation.walls`."""
+    """Of this module, and from ``growth`` on of `swarmsim.radiation.walls`."""
 
     width: float  # of h
     softer: float  # g
@@ -53,17 +56,17 @@ class Constants(NamedTuple):
     inside_depth: float
     between: float  # the same for a box between source and detector
     between_depth: float
-    between_slant: float  # that it loses by o
-    between_steep: float
+    between_slant: float  # l
+    between_steep: float  # k
     lost: float  # f
     lost_slant: float  # s
     sides: float  # ln of what a box between source and detector returns, and its change with t
     sides_depth: float
-    growth: float
-    growth_depth: float
-    depth: float
-    energy: float
-    energy_depth: float
+    growth: float  # a
+    growth_depth: float  # b
+    depth: float  # c
+    energy: float  # v
+    energy_depth: float  # w
 
 
 @lru_cache(maxsize=1)
@@ -144,7 +147,7 @@ def thin_m_of(box: Box) -> jax.Array:
 def scattered_share(box: Box, k: Constants | None = None) -> Shares:
     """Of each line and the box that it meets."""
     k = k or constants()
-    hollow = box.wall_m > 0.0
+    hollow = (box.wall_m > 0.0) & (least(box.half) > box.wall_m)
     thickness = jnp.maximum(jnp.where(hollow, box.wall_m, least(box.half)), _LEAST_M)
     ends = [_outside(x, box.half, thickness) for x in (box.start, box.end)]
     walls = jnp.maximum(ends[0] + ends[1], 1.0)
@@ -169,8 +172,8 @@ def scattered_share(box: Box, k: Constants | None = None) -> Shares:
         one = sum(_sum(jnp.where(x, s[t], 0.0)) for x, s in zip(opposite, seen, strict=True))
         other = sum(_sum(jnp.where(x, 0.0, s[t])) for x, s in zip(opposite, seen, strict=True))
         found.append((one * jnp.exp(of_through) + other * jnp.exp(of_returned)) / wide[t])
-    # an end within the matter of a solid box: as a slab
-    among = jnp.where(hollow, 1.0, ends[0] * ends[1])
+    # an end within matter: as a slab, of a hollow box the more so the nearer it is to the middle of the wall
+    among = jnp.where(hollow, jnp.abs((2.0 * ends[0] - 1.0) * (2.0 * ends[1] - 1.0)), ends[0] * ends[1])
     shares = jax.lax.optimization_barrier([1.0 + among * (s - 1.0) for s in found])
     return Shares(share=shares, closed=inside, walls=jnp.where(hollow, walls, 1.0), thin_m=thin * distance)
 
@@ -204,8 +207,8 @@ def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Face
     inverse = [1.0 / jnp.maximum(jnp.square(h * h), 1e-12) for h in box.half]
     total = inverse[0] + inverse[1] + inverse[2]
     edge = jnp.where(hollow, 0.5 * box.wall_m, 0.0)
-    squared = sum(jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True))
-    found = []
+    x, y, z = (jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True))
+    squared, found = x + y + z, []
     for sign in (1.0, -1.0):
         rows = []
         for axis in range(3):
@@ -236,8 +239,10 @@ def _seen(faces: _Faces, nodes_of_edge: int, k: Constants) -> list[jax.Array]:
         far += jnp.square(jnp.maximum(jnp.maximum(low - foot, foot - high), 0.0))
     h = k.width * jnp.sqrt(near * far) / (jnp.sqrt(near) + jnp.sqrt(far))
     part = near / (near + far)
+    # a face that is seen from one side has one place, whichever way the line runs
+    apart = jnp.where(faces.opposite, 1.0, 0.0)
     along, across = (
-        _along(low, high, foot * part, h, nodes_of_edge) for low, high, foot in zip(*faces[2:5], strict=True)
+        _along(low, high, foot * part, h, nodes_of_edge, apart) for low, high, foot in zip(*faces[2:5], strict=True)
     )
     scale = faces.weight * faces.squared * (1.0 / (2.0 * np.pi))
     along, across, scale = jax.lax.optimization_barrier((along, across, scale))
@@ -272,14 +277,14 @@ class _Node(NamedTuple):
 
 
 def _along(
-    low: jax.Array, high: jax.Array, middle: jax.Array, h: jax.Array, nodes: int
+    low: jax.Array, high: jax.Array, middle: jax.Array, h: jax.Array, nodes: int, apart: jax.Array | float = 1.0
 ) -> list[tuple[jax.Array, jax.Array]]:
-    """Places along one edge, and their weights."""
+    """Places along one edge, and their weights; with ``apart`` 0 all in the middle."""
     first, last = low - middle, high - middle
     first, last = (x * jax.lax.rsqrt(x * x + h * h) for x in (first, last))
     half, centre, found = 0.5 * (last - first), 0.5 * (first + last), []
     for node, weight in zip(*np.polynomial.legendre.leggauss(nodes), strict=True):
-        u = centre + float(node) * half
+        u = centre + float(node) * apart * half
         root = jax.lax.rsqrt(jnp.maximum(1.0 - u * u, 1e-9))
         found.append((middle + h * u * root, float(weight) * half * h * root * root * root))
     return found

@@ -23,6 +23,7 @@ LINES = 8  # as the localisation has
 def ways(detector: Detector, seed: int, count: int, walls: float = 0.3) -> tuple[Crossed, jax.Array, jax.Array]:
     """Drawn places around a source at the origin, seen through air and up to so much concrete."""
     rng = np.random.default_rng(seed)
+    other = np.random.default_rng(count)
     place = rng.normal(size=(count, 3))
     place *= rng.uniform(3.0, 60.0, (count, 1)) / np.linalg.norm(place, axis=1, keepdims=True)
     axis = rng.normal(size=(count, 3))
@@ -34,8 +35,8 @@ def ways(detector: Detector, seed: int, count: int, walls: float = 0.3) -> tuple
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     shape = Shape(
         thin_m=f32(length * np.where(rng.random(length.shape) < 0.5, 1.0, rng.uniform(0.3, 1.0, length.shape))),
-        share=f32(rng.uniform(0.1, 1.0, (count, len(DEPTHS)))), closed=f32(rng.integers(2, size=count)),
-        walls=f32(rng.uniform(1.0, 2.0, count)),
+        share=f32(rng.uniform(0.1, 1.0, count)[:, None] * other.uniform(0.7, 1.4, (count, len(DEPTHS)))),
+        closed=f32(rng.integers(2, size=count)), walls=f32(other.uniform(1.0, 2.0, count)),
         ground=f32(np.sort(rng.uniform(0.0, 1.0, (count, 2)))[:, ::-1]),
     )  # fmt: skip
     return Crossed(length_m=f32(length), place=f32(between), shape=shape), f32(place), f32(axis)

@@ -252,7 +252,7 @@ def test_the_short_way_through_a_wall_and_what_is_seen_of_it():
     assert np.all(np.diff(oblique.share) < 0.0)  # the thicker it is, the less comes through at an angle
     assert float(oblique.share[-1]) < 0.5
     ends = [shape_of(site, (-5, y, 0), (5, y, 0))[2].share for y in (199.99, 190.0)]
-    np.testing.assert_allclose(ends[0], 0.5, atol=0.02)
+    np.testing.assert_allclose(ends[0], 0.5, atol=0.05)
     np.testing.assert_allclose(ends[1], 1.0, atol=0.05)
 
 
