@@ -32,14 +32,17 @@ from swarmsim.site.surfaces import Box, Constants, constants, scattered_share
 ENERGIES = (60.0, 122.0, 356.0, 662.0, 1332.0), (0.1, 0.2, 0.2, 0.25, 0.25)  # and how often they are drawn
 MATERIALS = ("concrete", "brick", "steel", "lead"), (0.4, 0.25, 0.25, 0.1)
 THICKNESS_M = {"concrete": (0.04, 0.3), "brick": (0.08, 0.36), "steel": (0.001, 0.02), "lead": (0.001, 0.02)}
-RUNS = {"inside": 30, "container": 8, "wall": 24, "behind": 14}  # of each seed
+RUNS = {"inside": 30, "container": 8, "cube": 4, "wall": 24, "square": 3, "behind": 14}  # of each seed
 TOLD = {
     "inside": "in a closed building",
     "container": "in a container of steel",
+    "cube": "in the middle of a cube",
     "wall": "a free-standing wall between",
+    "square": "a wide wall between, crossed squarely",
     "behind": "a closed building between",
 }
-ENCLOSED = ("inside", "container")  # the source
+ENCLOSED = ("inside", "container", "cube")  # the source
+SOLID = ("wall", "square")
 VIEWS = 8
 COLLISIONS = 30
 POSITIVE = (
@@ -102,8 +105,14 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
     if kind == "container":
         material, thickness = "steel", between(0.001, 0.006)
         x, y, z = 0.5 * between(2.0, 12.2), 0.5 * between(2.0, 2.6), between(2.0, 3.0)
-    low, high = np.array([-x, -y, 0.0]), np.array([x, y, z])
-    if kind in ENCLOSED:
+    elif kind == "cube":
+        x = y = z = 1.0 + thickness
+    elif kind == "square":
+        y, z = between(8.0, 15.0), between(8.0, 15.0)
+    low, high = np.array([-x, -y, -z if kind in ("cube", "square") else 0.0]), np.array([x, y, z])
+    if kind == "cube":
+        source = np.zeros(3)
+    elif kind in ENCLOSED:
         least, most = low + thickness, high - thickness
         margin = np.minimum(0.25, 0.3 * (most - least))
         source = rng.uniform(least + margin, most - margin)
@@ -115,7 +124,15 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
         if rng.random() < 0.5:
             thickness = between(0.5, 1.5) * THICKNESS_M[material][1] / 2
         low[0], high[0] = -0.5 * thickness, 0.5 * thickness
-        source = np.array([low[0] - between(0.2, 8.0), rng.uniform(-y, y), rng.uniform(0.3, min(2.0, z))])
+        near, aside = (0.2, y) if kind == "wall" else (0.3, 1.0)
+        source = np.array([low[0] - between(near, 8.0), rng.uniform(-aside, aside), rng.uniform(0.3, min(2.0, z))])
+    block = Block(tuple(low), tuple(high), 0.0 if kind in SOLID else thickness, material)
+    pieces = np.array([[low, high]]) if kind in SOLID else shell_of(low, high, thickness)
+    return Drawn(kind, material, energy, block, pieces, source, _beyond(rng, kind, source, np.array([low, high])))
+
+
+def _beyond(rng: np.random.Generator, kind: str, source: Floats, box: Floats) -> Floats:
+    """Detectors [VIEWS, 3] beyond a box [2, 3] that the lines from the source cross."""
     detectors: list[Floats] = []
     while len(detectors) < VIEWS:
         level = rng.random() >= 0.5
@@ -123,13 +140,14 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
         azimuth = rng.uniform(0.0, 2.0 * np.pi)
         if kind not in ENCLOSED:
             azimuth, elevation = rng.normal(0.0, 0.8), abs(elevation)
+        if kind == "square":
+            azimuth, elevation = rng.uniform(-0.2, 0.2, 2)
         way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-        ends = np.sort((np.array([low, high]) - source) / np.where(np.abs(way) < 1e-9, 1e-9, way), axis=0)
+        ends = np.sort((box - source) / np.where(np.abs(way) < 1e-9, 1e-9, way), axis=0)
         if ends[1].min() > max(ends[0].max(), 0.0):
-            detectors.append(source + way * (ends[1].min() + between(1.0, 30.0)))
-    block = Block(tuple(low), tuple(high), 0.0 if kind == "wall" else thickness, material)
-    pieces = np.array([[low, high]]) if kind == "wall" else shell_of(low, high, thickness)
-    return Drawn(kind, material, energy, block, pieces, source, np.array(detectors))
+            distance = float(np.exp(rng.uniform(np.log(1.0), np.log(30.0))))
+            detectors.append(source + way * (ends[1].min() + distance))
+    return np.array(detectors)
 
 
 def shell_of(low: Floats, high: Floats, wall_m: float) -> Floats:

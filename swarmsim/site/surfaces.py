@@ -8,15 +8,18 @@ is its middle plane, of each axis as far as the box is thin along it. A place of
 photons, with d, d' the distances of source and detector, c, c' the cosines there, and cos that of the angle between the
 ways to and from it. F is what scatters once and is not lost on its way through the wall, of depth t,
 
-    (e^(-t / c) - e^(-g t / c')) / (g t / c' - t / c)              to the other side (m = M_t c^2 c')
-    b (1 - e^(-t / c - g t / c')) / (t / c + g t / c')             back (m = N_t c c')
+    (e^(-t / c) - e^(-g t / c')) / (g t / c' - t / c)         to the other side
+    b (1 - e^(-t / c - g t / c')) / (t / c + g t / c')        back
 
-g and b being for the photons' lower energy; the rest scatters more often. The integral over the face is taken at
-`NODES` x `NODES` places, Gauss-Legendre's in u = (x - x0) / sqrt((x - x0)^2 + h^2) along each edge, with x0 and h the
-place and the width of the part of the plane that contributes most. The sum over the faces is divided by that of an
-infinite wall between the same two distances. What comes back from the other walls of a box passes one more on its way:
-it is e^(-f t (1 + s o / (1 + o))), o being the line's metres in the wall over its thickness, less 1. All of this is
-computed for walls of `DEPTHS`, and is interpolated between by the depth that a line has (`swarmsim.radiation.walls`).
+g and b being for the photons' lower energy. Photons that scatter more often are in the constants, and m = M c^2 c' of
+them come through the deepest of `DEPTHS` where the line itself does not. The integral over a face between source and
+detector is taken at `NODES` x `NODES` places, Gauss-Legendre's in u = (x - x0) / sqrt((x - x0)^2 + h^2) on each edge,
+with x0 and h the place and the width of the part of the plane that contributes most; of the other faces one place does.
+The sum over the faces is divided by that of an infinite wall between the same two distances. What comes back from the
+other walls of a box passes one more on its way: it is multiplied by e^(-f t (1 + s o / (1 + o))), o being the line's
+metres in the wall over its thickness, less 1; what comes through both walls of a box between source and detector by
+e^(-l t o / (1 + k o)). All of this is computed for walls of `DEPTHS`, and `swarmsim.radiation.walls` interpolates by
+the depth that a line has.
 
 Constants are those of ``configs/elements/walls.csv``, fitted to the Monte Carlo by ``experiments/transport/walls.py``.
 """
@@ -33,16 +36,16 @@ from swarmsim.config.files import packaged_dir
 DEPTHS = (0.25, 0.75, 2.25, 6.75)
 """Depths of a wall in mean free paths, each three times the one before."""
 NODES = 2
-"""Of each edge of a face towards the detector."""
+"""Places along each edge of a face towards the detector."""
 AWAY = 1
-"""Of the other faces."""
+"""The same of the other faces."""
 PARALLEL_M = 1e-9  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
 _LEAST_COSINE = 1e-3
 
 
 class Constants(NamedTuple):
-    """Of this module, and from ``energy_0`` on of `swarmsim.radiation.walls`."""
+    """Of this module, and from ``growth`` on of `swarmsim.radiation.walls`."""
 
     width: float  # of h
     softer: float  # g
@@ -53,17 +56,17 @@ class Constants(NamedTuple):
     inside_depth: float
     between: float  # the same for a box between source and detector
     between_depth: float
-    between_slant: float  # that it loses by o
-    between_steep: float
+    between_slant: float  # l
+    between_steep: float  # k
     lost: float  # f
     lost_slant: float  # s
     sides: float  # ln of what a box between source and detector returns, and its change with t
     sides_depth: float
-    growth: float
-    growth_depth: float
-    depth: float
-    energy: float
-    energy_depth: float
+    growth: float  # a
+    growth_depth: float  # b
+    depth: float  # c
+    energy: float  # v
+    energy_depth: float  # w
 
 
 @lru_cache(maxsize=1)
@@ -149,7 +152,7 @@ def thin_m_of(box: Box) -> jax.Array:
 def scattered_share(box: Box, k: Constants | None = None) -> Shares:
     """Of each line and the box that it meets."""
     k = k or constants()
-    hollow = box.wall_m > 0.0
+    hollow = (box.wall_m > 0.0) & (least(box.half) > box.wall_m)
     thickness = jnp.maximum(jnp.where(hollow, box.wall_m, least(box.half)), _LEAST_M)
     ends = [_outside(x, box.half, thickness) for x in (box.start, box.end)]
     walls = jnp.maximum(ends[0] + ends[1], 1.0)
