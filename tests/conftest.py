@@ -12,6 +12,11 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that the spreading of batches is tested
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see swarmsim/__init__.py
+# Two workers share two cores: threads of NumPy's that wait for work by spinning tripled the time of building a mission.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Of the workers and of the programs that tests start: a compiler's millions of small objects are taken from and put
+# back on lists of each thread, and not merged with their neighbours at once.
+os.environ.setdefault("GLIBC_TUNABLES", "glibc.malloc.tcache_count=65535")
 # Most of the suite's time is compilation. Without LLVM's second level, and with the older emitter of loops where there
 # is the choice, it takes half as long, and what is tested runs as fast.
 _FLAGS = ["--xla_backend_optimization_level=1"]
@@ -60,6 +65,11 @@ _FIRST = (
     "world/test_transforms.py",
 )
 
+_MAPS = 15_000  # the largest files take as many again
+_BYTES = 2.5e9
+# Tracing makes millions of objects that live on: collections among them, at the usual 700, took a tenth of the time.
+gc.set_threshold(200_000, 50, 50)
+
 settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("deterministic")
 
@@ -77,10 +87,30 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def programs_of_a_file(request: pytest.FixtureRequest) -> Iterator[None]:
     """Compile quickly, but for files that compute for long (marked ``optimised``); free the programs afterwards.
 
-    Some hundred of them would use up a process's memory maps.
+    Small ones that JAX keeps, which most files have in common, stay until there is little room for more, or until
+    they would be of the other kind.
     """
-    jax.config.update("jax_disable_most_optimizations", request.node.get_closest_marker("optimised") is None)
+    quickly = request.node.get_closest_marker("optimised") is None
+    if jax.config.values["jax_disable_most_optimizations"] != quickly:
+        jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", quickly)
     yield
     programs.forget()
-    jax.clear_caches()
+    if not _has_room():
+        jax.clear_caches()
+        gc.unfreeze()
     gc.collect()
+    gc.freeze()  # what is left lives on, and is passed over by the next collection
+
+
+def _has_room() -> bool:
+    """Whether another file's programs find room: in memory, and in the 65,530 maps that Linux allows a process.
+
+    Each program takes some maps.
+    """
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        maps = Path("/proc/self/maps").read_bytes().count(b"\n")
+    except OSError:
+        return False
+    return maps < _MAPS and pages * os.sysconf("SC_PAGE_SIZE") < _BYTES
