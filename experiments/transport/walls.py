@@ -6,7 +6,7 @@ writes ``walls.csv``, prints how far the model is from the Monte Carlo, and the 
 ``configs/elements/walls.csv``. Thirty minutes on one core.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -220,8 +220,8 @@ def known(found: list[Case]) -> list[Case]:
     return [c for c, counts in total if counts > FAINT and c.error < KNOWN * counts]
 
 
-def fitted(found: list[Case], lines: Floats, way: Crossed, detector: Detector, start: Constants) -> Constants:
-    """The constants that bring the model nearest to the Monte Carlo: least squares of logarithms, robust.
+def deviations(found: list[Case], lines: Floats, way: Crossed, detector: Detector) -> Callable[[Constants], jax.Array]:
+    """Logarithm of model over Monte Carlo [n] of the `known` cases, for any constants.
 
     ``lines`` are the `lines_of` the cases; every case crosses one box.
     """
@@ -233,13 +233,8 @@ def fitted(found: list[Case], lines: Floats, way: Crossed, detector: Detector, s
     direct, scattered = (
         jnp.array([getattr(found[i], name) for i in rows], jnp.float32) for name in ("uncollided", "scattered")
     )
-    log = [name in POSITIVE for name in Constants._fields]
 
-    def of(values: Floats | jax.Array) -> Constants:
-        return Constants(*(jnp.exp(x) if is_log else x for x, is_log in zip(values, log, strict=True)))
-
-    def apart(values: jax.Array) -> jax.Array:
-        k = of(values)
+    def apart(k: Constants) -> jax.Array:
         assert some.shape is not None
         seen = replace(some, shape=replace(some.shape, share=jnp.stack(scattered_share(box, k).share, axis=-1)))
 
@@ -249,12 +244,24 @@ def fitted(found: list[Case], lines: Floats, way: Crossed, detector: Detector, s
 
         return jnp.log((direct + jax.vmap(one)(number, seen)) / (direct + scattered))
 
-    value, slope = jax.jit(apart), jax.jit(jax.jacfwd(apart))
+    return apart
+
+
+def fitted(apart: Callable[[Constants], jax.Array], start: Constants) -> Constants:
+    """The constants with the smallest `deviations`: robust least squares, of the logarithms of `POSITIVE` ones."""
+    log = [name in POSITIVE for name in Constants._fields]
+
+    def of(values: Floats | jax.Array) -> Constants:
+        return Constants(*(jnp.exp(x) if is_log else x for x, is_log in zip(values, log, strict=True)))
+
+    value = jax.jit(lambda x: apart(of(x)))
+    slope = jax.jit(jax.jacfwd(lambda x: apart(of(x))))
     best = least_squares(
         lambda x: np.asarray(value(jnp.asarray(x, jnp.float32)), float),
         [np.log(x) if is_log else x for x, is_log in zip(start, log, strict=True)],
         jac=lambda x: np.asarray(slope(jnp.asarray(x, jnp.float32)), float),
         loss="cauchy",
+        x_scale="jac",
         f_scale=FLAT,
         max_nfev=MOST_STEPS,
     )
@@ -281,9 +288,8 @@ def main(
     print("Those that were not fitted to:\n" + told([c for c in found if c.seed == last]))
     rows = np.array([i for i, c in enumerate(found) if c.seed < max(last, 2)])
     way = jax.tree.map(lambda *x: jnp.concatenate(x)[rows], *parts)
-    best = fitted(
-        [found[i] for i in rows], np.vstack(lines)[rows], way, detector_of(load_library(), detector), constants()
-    )
+    own = deviations([found[i] for i in rows], np.vstack(lines)[rows], way, detector_of(load_library(), detector))
+    best = fitted(own, constants())
     print("Constants:\n" + "\n".join(f"{name},{value:.4g}" for name, value in best._asdict().items()))
 
 
