@@ -63,7 +63,7 @@ class LiveMission:
     def prepare(self) -> None:
         """Load or compile all programs, and run each of them once: no setpoint then waits for a compiler."""
         self.start()
-        self._run.prepare(self._mission)
+        self._run.prepare(self._mission, segments=False)
         for number in range(len(self._simulation.plan.phases)):  # for no mission
             self._mission = self._run.begin(number, self._mission, 0, np.zeros(1, bool))
         self.start()

@@ -151,10 +151,11 @@ class MissionRun:
             "in_turn": True,
         }
 
-    def prepare(self, mission: MissionState) -> None:
+    def prepare(self, mission: MissionState, *, segments: bool = True) -> None:
         """Begin to load or compile all programs of the mission, in the order that they are needed.
 
-        The estimate, which takes longest, begins early beside the others.
+        The estimate, which takes longest, begins early beside the others. A mission with a vehicle outside goes on
+        otherwise than in ``segments``.
         """
         nobody, groups = np.zeros(self._batch.missions, bool), len(mission.world.groups)
         beginnings = [self._beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
@@ -162,8 +163,8 @@ class MissionRun:
         if mission.survey is not None:
             estimate = [self._estimate(mission, mission.survey, nobody, afresh=True)]
             naming = [self._naming(mission, mission.survey)] if self._plan.spectrometer >= 0 else []
-        run = self._advance(mission, 0, np.ones(groups, bool))
-        calls = [*beginnings[:1], *estimate, run, *beginnings[1:], *naming]
+        run = [self._advance(mission, 0, np.ones(groups, bool))] if segments else []
+        calls = [*beginnings[:1], *estimate, *run, *beginnings[1:], *naming]
         self._batch.prepare(calls)
 
     def _first_world(self) -> World:

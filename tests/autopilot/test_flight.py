@@ -6,50 +6,38 @@ import time
 import numpy as np
 import pytest
 
-import swarmsim
 from swarmsim.autopilot.flight import Flight, place_in_mission
 from swarmsim.autopilot.flown import report
 from swarmsim.autopilot.frames import Geodetic, geodetic_of_enu
 from swarmsim.autopilot.link import LinkError, Mode, Telemetry
 from swarmsim.config.autopilot import Autopilot, Origin, Watchdogs
-from swarmsim.runtime.live import LiveMission
 from tests.autopilot.fake_link import FakeLink
+from tests.autopilot.live_missions import UAVS, prepared
 
-SURVEY = [
-    "engine=analytic", "mapping=null", "localisation=null", "identification=null",
-    "phases=[{name: survey, who: [uav1], policy: waypoints, "
-    "settings: {points: [[-70, -42], [-66, -42]], speed_m_s: 4.0, altitude_m: 6.0}, time_limit_s: 60.0}]",
-]  # fmt: skip
+SURVEY = (
+    "{name: survey, who: [uav1], policy: waypoints, "
+    "settings: {points: [[-70, -42], [-66, -42]], speed_m_s: 4.0, altitude_m: 6.0}, time_limit_s: 60.0}"
+)
 QUICK = Autopilot(
     take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=10.0, land_s=20.0,
     watchdogs=Watchdogs(heartbeat_s=3.0, position_s=2.0, stale_s=3.0, hold_s=0.1),  # a loaded machine pauses
 )  # fmt: skip
-
-
-LATE = [
-    *SURVEY[:-1],
-    "phases=[{name: first, who: [uav2], policy: waypoints, "
+LATE = (
+    "{name: first, who: [uav2], policy: waypoints, "
     "settings: {points: [[-74, -47]], speed_m_s: 4.0, altitude_m: 3.0}, time_limit_s: 3.0}, "
     "{name: second, who: [uav1], policy: waypoints, start: {after: first}, "
-    "settings: {points: [[-72, -42]], speed_m_s: 4.0, altitude_m: 4.0}, time_limit_s: 20.0}]",
-]  # fmt: skip
-
-
-def prepared(overrides):
-    simulation = swarmsim.build(swarmsim.load("recon", overrides))
-    mission = LiveMission(simulation, 0, "uav1")
-    mission.prepare()
-    return mission
+    "settings: {points: [[-72, -42]], speed_m_s: 4.0, altitude_m: 4.0}, time_limit_s: 20.0}"
+)
 
 
 @pytest.fixture(scope="module")
 def live():
-    return prepared(SURVEY)
+    return prepared("uav1", UAVS, SURVEY)
 
 
 @pytest.fixture(scope="module")
 def late():
-    return prepared(LATE)
+    return prepared("uav1", UAVS, LATE)
 
 
 def flown(live, link, settings=QUICK, during=None):

@@ -7,23 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import swarmsim
 from swarmsim.autopilot.flight import Flight
 from swarmsim.autopilot.link import LinkError, Mode
 from swarmsim.autopilot.manual.sticks import CENTRED, Event, Reading, Sticks
 from swarmsim.autopilot.simulated import SimulatedLink, load_manners
 from swarmsim.autopilot.standin.kinematic import KinematicBody
 from swarmsim.config.autopilot import Autopilot
-from swarmsim.runtime.live import LiveMission
+from tests.autopilot.live_missions import ROVER, UAVS, prepared
 
-PLAIN = ["engine=analytic", "mapping=null", "localisation=null", "identification=null"]
 SURVEY = (
-    "phases=[{name: survey, who: [uav1], policy: waypoints, "
-    "settings: {points: [[-70, -42], [-66, -42]], speed_m_s: 4.0, altitude_m: 6.0}, time_limit_s: 20.0}]"
+    "{name: survey, who: [uav1], policy: waypoints, "
+    "settings: {points: [[-70, -42], [-66, -42]], speed_m_s: 4.0, altitude_m: 6.0}, time_limit_s: 20.0}"
 )
 DRIVE = (
-    "phases=[{name: drive, who: [orpheus], policy: waypoints, "
-    "settings: {points: [[-76, -50]], speed_m_s: 0.9}, time_limit_s: 60.0}]"
+    "{name: drive, who: [orpheus], policy: waypoints, "
+    "settings: {points: [[-76, -50]], speed_m_s: 0.9}, time_limit_s: 60.0}"
 )
 QUICK = Autopilot(take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=20.0, land_s=30.0)
 MANNERS = load_manners().model_copy(update={"land_speed_m_s": 2.0, "land_speed_high_m_s": 2.0})
@@ -47,20 +45,14 @@ class Script:
         return "keys"
 
 
-def prepared(vehicle, phases):
-    live = LiveMission(swarmsim.build(swarmsim.load("recon", [*PLAIN, phases])), 0, vehicle)
-    live.prepare()
-    return live
-
-
 @pytest.fixture(scope="module")
 def uav():
-    return prepared("uav1", SURVEY)
+    return prepared("uav1", UAVS, SURVEY)
 
 
 @pytest.fixture(scope="module")
 def rover():
-    return prepared("orpheus", DRIVE)
+    return prepared("orpheus", ROVER, DRIVE)
 
 
 def flown(live, script, flies=True, settings=QUICK):
@@ -115,6 +107,7 @@ def test_taken_over_and_handed_back_the_mission_goes_on(uav):
 
     def script(flight, pilot, link):
         begun(flight)
+        until(lambda: flight.log.rows)  # a loaded machine pauses
         pilot.ask(Event.TAKE_OVER)
         until(lambda: flight.helm.flies)
         until(lambda: flight.helm._pilot.holds)

@@ -7,20 +7,18 @@ from contextlib import ExitStack, contextmanager
 import numpy as np
 import pytest
 
-import swarmsim
 from swarmsim.autopilot.ardrone.navdata import State
 from swarmsim.autopilot.flight import Flight
 from swarmsim.autopilot.flown import report
 from swarmsim.autopilot.link import LinkError
 from swarmsim.config.autopilot import Autopilot, Watchdogs
-from swarmsim.runtime.live import LiveMission
+from tests.autopilot.live_missions import UAVS, prepared
 from tests.autopilot.stick_peers import ardrone_link, ardrone_peer, pelican_link, pelican_peer
 
-SURVEY = [
-    "engine=analytic", "mapping=null", "localisation=null", "identification=null",
-    "phases=[{name: survey, who: [uav1], policy: waypoints, settings: {points: [[-70, -42], [-66, -42]], "
-    "speed_m_s: 1.5, altitude_m: 3.0, climb_speed_m_s: 0.7, descent_speed_m_s: 0.7}, time_limit_s: 60.0}]",
-]  # fmt: skip
+SURVEY = (
+    "{name: survey, who: [uav1], policy: waypoints, settings: {points: [[-70, -42], [-66, -42]], "
+    "speed_m_s: 1.5, altitude_m: 3.0, climb_speed_m_s: 0.7, descent_speed_m_s: 0.7}, time_limit_s: 60.0}"
+)
 SETTINGS = Autopilot(
     take_off_m=1.5, answer_s=5.0, ready_s=10.0, take_off_s=20.0, land_s=40.0,
     watchdogs=Watchdogs(heartbeat_s=2.0, position_s=1.5, stale_s=1.0, hold_s=0.1),
@@ -30,10 +28,7 @@ OUTLINE = np.array([[-100.0, -100.0], [100.0, -100.0], [100.0, 100.0], [-100.0, 
 
 @pytest.fixture(scope="module")
 def live():
-    simulation = swarmsim.build(swarmsim.load("recon", SURVEY))
-    mission = LiveMission(simulation, 0, "uav1")
-    mission.prepare()
-    return mission
+    return prepared("uav1", UAVS, SURVEY)
 
 
 @contextmanager
