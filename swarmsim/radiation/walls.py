@@ -81,7 +81,8 @@ def scattered_counts(
     of_walls, mixed = jnp.ones_like(depth), jnp.zeros_like(depth)  # the growth's derivative by the part that is walls
     if air is not None:
         of_walls = 1.0 - layers[..., air] / (depth + 1e-9)
-        p = scatter_1_m[..., air] / attenuation_1_m[:, air]  # [positions, COEFFICIENTS, L]
+        # a nuclide with fewer lines than others has some without attenuation
+        p = scatter_1_m[..., air] / jnp.maximum(attenuation_1_m[:, air], 1e-9)  # [positions, COEFFICIENTS, L]
         q = [near[..., air, None] * p[0, j] + (1.0 - near[..., air, None]) * p[1, j] for j in range(p.shape[1])]
         apart = growth - (q[0] + q[1] * t + q[2] * logs[0] + q[3] * logs[1])
         mixed = jnp.where(of_walls > 1e-3, apart / jnp.maximum(of_walls, 1e-3), 0.0)

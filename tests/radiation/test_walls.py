@@ -9,7 +9,7 @@ import pytest
 
 from swarmsim.radiation import Detector, roi_rates, spectrum_rate
 from swarmsim.radiation.detector import AIR
-from swarmsim.radiation.rate import from_ground, line_rates, transmission
+from swarmsim.radiation.rate import from_ground, line_rates, roi_rates_and_slopes, transmission
 from swarmsim.site import Crossed
 from swarmsim.site.rays import Shape
 from swarmsim.site.surfaces import DEPTHS, constants
@@ -48,6 +48,21 @@ def test_a_wall_scatters_as_far_as_it_is_seen_and_air_does_not_care(detectors: D
     wall, air = through(d, concrete=0.1), through(d, air=30.0)
     np.testing.assert_allclose(scattered(d, shaped(wall, share=0.3)), 0.3 * scattered(d, wall), rtol=1e-5)
     np.testing.assert_allclose(scattered(d, shaped(air, share=0.3, closed=1.0)), scattered(d, air), rtol=1e-4)
+
+
+def test_derivatives_are_numbers_for_nuclides_of_few_lines_as_well(detectors: Detectors) -> None:
+    """The lines that they lack have neither energy nor attenuation."""
+    d = detectors["nai_2x2", "physical"]
+    ways = [shaped(through(d, **matter), 0.5, 1.0) for matter in ({"air": 9.0}, {"concrete": 0.2, "air": 9.0}, {})]
+    way = jax.tree.map(lambda *x: jnp.stack(x), *ways)
+    places, axes = jnp.tile(PLACE, (3, 1)), jnp.tile(UP, (3, 1))
+    by = tuple(d.material_names.index(name) for name in ("concrete", AIR))
+    assert float(jnp.min(jnp.sum(d.yields > 0.0, axis=1))) < d.yields.shape[1]
+    for nuclide in d.nuclide_names:
+        rates, slopes = roi_rates_and_slopes(d, point(d, nuclide), way, places, axes, by)
+        assert np.isfinite(rates).all()
+        assert np.isfinite(slopes).all()
+        assert np.any(np.asarray(slopes[1, 0]) != 0.0)
 
 
 @pytest.mark.parametrize("walls", [1.0, 2.0])
