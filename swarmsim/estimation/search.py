@@ -29,7 +29,7 @@ from swarmsim.site.model import bounds_m
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
 GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
 FITTED = 4  # of the candidates of a round: the best of each part
-STEPS = 3  # Gauss-Newton steps at a place
+STEPS = 4  # Gauss-Newton steps at a place
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
 ROUNDING = 1e-5  # of sums over all windows, relative
 FARTHEST = 6.0  # standard deviations of a place within which others are looked for along its uncertainty
