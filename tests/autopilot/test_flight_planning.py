@@ -7,15 +7,15 @@ import pytest
 
 from swarmsim.autopilot.link import Mode
 from tests.autopilot.fake_link import FakeLink
-from tests.autopilot.test_flight import QUICK, SURVEY, flown, prepared, reached
+from tests.autopilot.live_missions import UAVS, prepared
+from tests.autopilot.test_flight import QUICK, flown, reached
 
-TWICE = [
-    *SURVEY[:-1],
-    "phases=[{name: first, who: [uav1], policy: waypoints, "
+TWICE = (
+    "{name: first, who: [uav1], policy: waypoints, "
     "settings: {points: [[-60, -42]], speed_m_s: 4.0, altitude_m: 4.0}, time_limit_s: 3.0}, "
     "{name: second, who: [uav1], policy: waypoints, start: {after: first}, "
-    "settings: {points: [[-64, -46]], speed_m_s: 4.0, altitude_m: 4.0}, time_limit_s: 20.0}]",
-]  # fmt: skip
+    "settings: {points: [[-64, -46]], speed_m_s: 4.0, altitude_m: 4.0}, time_limit_s: 20.0}"
+)
 PLANS = "plan second"
 
 
@@ -39,7 +39,7 @@ class Planning:
 
 @pytest.fixture(scope="module")
 def twice():
-    return prepared(TWICE)
+    return prepared("uav1", UAVS, TWICE)
 
 
 @pytest.fixture

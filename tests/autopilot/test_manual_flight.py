@@ -12,7 +12,7 @@ from swarmsim.autopilot.link import LinkError, Mode
 from swarmsim.autopilot.manual.sticks import CENTRED, Event, Reading, Sticks
 from swarmsim.autopilot.simulated import SimulatedLink, load_manners
 from swarmsim.autopilot.standin.kinematic import KinematicBody
-from swarmsim.config.autopilot import Autopilot
+from swarmsim.config.autopilot import Autopilot, Watchdogs
 from tests.autopilot.live_missions import ROVER, UAVS, prepared
 
 SURVEY = (
@@ -23,7 +23,10 @@ DRIVE = (
     "{name: drive, who: [orpheus], policy: waypoints, "
     "settings: {points: [[-76, -50]], speed_m_s: 0.9}, time_limit_s: 60.0}"
 )
-QUICK = Autopilot(take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=20.0, land_s=30.0)
+QUICK = Autopilot(
+    take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=20.0, land_s=30.0,
+    watchdogs=Watchdogs(stale_s=1.5),  # a loaded machine pauses
+)  # fmt: skip
 MANNERS = load_manners().model_copy(update={"land_speed_m_s": 2.0, "land_speed_high_m_s": 2.0})
 OUTLINE = np.array([[-100.0, -100.0], [100.0, -100.0], [100.0, 100.0], [-100.0, 100.0]])
 
