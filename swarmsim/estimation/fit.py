@@ -289,22 +289,25 @@ def settle(
         exact: whether the rates are computed again with the lengths that were fitted, and a few further steps done;
             else they are extrapolated (`lengthened`; static).
     """
-    source = rates(problem, ways, nuclide, start.lengths)
-    if fresh:
-        start = _begun(problem, source, others, ways.position_m, start)
+    passes = [steps, MORE_STEPS] if exact and problem.uncertain else [steps]
 
     def linear(u: Unknowns, source: Rates) -> Linearised:
         return linearised(problem, source, others, ways.position_m, u)
 
-    def step(carry: tuple[Unknowns, Rates], _: None) -> tuple[tuple[Unknowns, Rates], None]:
+    def step(_: int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
         u, source = carry
         moved = stepped(problem, u, normal_equations(problem, linear(u, source), u))
-        return (moved, lengthened(source, moved.lengths - u.lengths)), None
+        return moved, lengthened(source, moved.lengths - u.lengths)
 
-    (u, source), _ = jax.lax.scan(step, (start, source), None, length=steps)
-    if exact and problem.uncertain:
+    def pass_(number: jax.Array | int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
+        u, _ = carry
         source = rates(problem, ways, nuclide, u.lengths)
-        (u, source), _ = jax.lax.scan(step, (u, source), None, length=MORE_STEPS)
+        if fresh:
+            u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, ways.position_m, u), lambda: u)
+        return jax.lax.fori_loop(0, jnp.array(passes)[number], step, (u, source))
+
+    # a loop, so that what a pass does is compiled once
+    u, source = jax.lax.fori_loop(0, len(passes), pass_, (start, silent(problem)))
     return _settled(problem, linear(u, source), u, ways, source)
 
 

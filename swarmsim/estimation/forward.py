@@ -1,5 +1,6 @@
 """What sources add to the counts by region of interest: rays, transport, and the way of the crystal in a window."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -7,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from swarmsim.device import either
 from swarmsim.estimation.likelihood import position_of, travel_gain
@@ -15,7 +17,7 @@ from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import registered_share, roi_rates_and_slopes
 from swarmsim.site import Site, sample
-from swarmsim.site.rays import Crossed, crossed_from, nothing_crossed, stretched
+from swarmsim.site.rays import Crossed, crossed_from, stretched
 
 LEAST_ABOVE_M = 0.2  # height of a crystal above the ground
 EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
@@ -140,18 +142,16 @@ def inverse_square_gain(offset_m: jax.Array, pieces_m: jax.Array, rays: int) -> 
 
 def ways_from(problem: Problem, place: jax.Array) -> Ways:
     """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
-    position, materials = position_of(problem.site, place), len(problem.site.material_names)
-
-    def of_span(span: Span, nodes: Nodes) -> Crossed:
-        n = nodes.position_m.shape[0]
-        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
-        return either(
-            used,
-            lambda: crossed_from(problem.site, position, nodes.position_m),
-            lambda: nothing_crossed(n, materials),
-        )
-
-    crossed = tuple(of_span(span, nodes) for span, nodes in zip(problem.spans, problem.nodes, strict=True))
+    position, valid = position_of(problem.site, place), problem.measurements.valid
+    wanted = jnp.concatenate([jnp.repeat(valid[first:last], rays) for first, last, _, rays in problem.spans])
+    ends = jnp.concatenate([nodes.position_m for nodes in problem.nodes])
+    # of all spans at once: it is compiled at several places
+    every = crossed_from(problem.site, position, ends, wanted)
+    rows = np.cumsum([0, *(nodes.position_m.shape[0] for nodes in problem.nodes)])
+    crossed = tuple(
+        jax.tree.map(lambda x, part=slice(first, last): x[part], every)
+        for first, last in itertools.pairwise(rows.tolist())
+    )
     return Ways(crossed=crossed, position_m=position)
 
 

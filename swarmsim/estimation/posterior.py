@@ -26,7 +26,7 @@ from swarmsim.estimation.fit import MEAN_FLOOR, Others, Unknowns, alone, normal_
 from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.search import TOGETHER, attempt, bounds, screen_of, screened, spread
-from swarmsim.estimation.sources import ALONE_STEPS, State, without
+from swarmsim.estimation.sources import ALONE_STEPS, State, as_known, without
 from swarmsim.pytree import pytree
 
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
@@ -305,7 +305,7 @@ def _modes(problem: Problem, state: State, k: jax.Array, others: Others, u: Unkn
     Half of them are likely ones of many all around, by the screen; the rest is the other side of the way.
     """
     place, nuclide = state.sources.place[k], state.sources.nuclide[k]
-    best = attempt(problem, nuclide, others, u, place).fit
+    best = as_known(problem, state, k, jnp.array(False)).fit
     screen = screen_of(problem, others, best.rates, position_of(problem.site, place), best.unknowns)
     quick = with_one_ray(problem)
     scouts = spread(place, jnp.asarray(SCOUTED_M), HEIGHTS * problem.height_std_m, SCOUTS, jnp.zeros(()))

@@ -308,12 +308,15 @@ def _best(
         hopeless = adding & (number >= BEGINNINGS) & (ratio < HOPELESS * params.threshold)
         return (number < reaches.shape[0]) & ~hopeless
 
-    start = (first, _beginning(problem, state, slot, adding), jnp.zeros(known))
+    start = (first, as_known(problem, state, slot, adding), jnp.zeros(known))
     return jax.lax.while_loop(on, round_, start)[1:]
 
 
-def _beginning(problem: Problem, state: State, slot: jax.Array, adding: jax.Array) -> Tried:
-    """The source as it is known, or none; worse than any place that is fitted."""
+def as_known(problem: Problem, state: State, slot: jax.Array, adding: jax.Array) -> Tried:
+    """The source in ``slot`` as the state has it, or none if one is ``adding``; worse than any place that is fitted.
+
+    How its rates change with lengths is not known.
+    """
     s, unknown = state.sources, -jnp.asarray(jnp.inf)
     activity = jnp.maximum(s.activity_bq[slot], 1e-3)
     n, regions = problem.background.shape

@@ -20,7 +20,6 @@ from swarmsim.site.shapes import (
     in_axes,
     key_of,
     longest,
-    nothing_crossed,
     nothing_met,
     of_both,
     shaped,
@@ -112,12 +111,15 @@ def mirrored(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
     return ratio * jnp.stack([root, u])
 
 
-def crossed_from(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
-    """`crossed` [n] of the segments from ``a`` [3] to each of ``b`` [n, 3], in the way that suits the device."""
-    return _in_blocks(site, a, b) if on_processor() else by_threads(site, a, b)
+def crossed_from(site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None) -> Crossed:
+    """`crossed` [n] of the segments from ``a`` [3] to each of ``b`` [n, 3], in the way that suits the device.
+
+    Those not ``wanted`` [n] need not be followed: some of them come out as crossing nothing, of no length.
+    """
+    return _in_blocks(site, a, b, wanted) if on_processor() else by_threads(site, a, b)
 
 
-def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
+def _in_blocks(site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None) -> Crossed:
     """In blocks of neighbouring ends; clusters of boxes that none of a block's segments comes near are left out.
 
     Of the boxes of a cluster, those that a segment meets are taken one after another, for all segments of the block at
@@ -147,7 +149,15 @@ def _in_blocks(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
         found = jax.lax.cond(jnp.any(near), some, lambda: nothing)
         return jax.vmap(lambda end, own: _way(site, above, a, end, lambda *_: own))(ends, found)
 
-    ways = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], jax.lax.map(block, ends))
+    if wanted is None:
+        ways = jax.lax.map(block, ends)
+    else:
+        parts = jnp.pad(wanted, (0, -n % size)).reshape(-1, size)
+        unseen = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(block, ends[0]))
+        ways = jax.lax.map(
+            lambda x: jax.lax.cond(jnp.any(x[1]), block, lambda _: unseen, x[0]), (ends, parts)
+        )  # fmt: skip
+    ways = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], ways)
     return shaped(every, jnp.broadcast_to(a, b.shape), b, ways, PAIRS)
 
 
@@ -323,6 +333,6 @@ def _of_boxes(
 
 
 __all__ = [
-    "Crossed", "Shape", "above_of", "by_threads", "crossed", "crossed_from", "mirrored", "nothing_crossed",
+    "Crossed", "Shape", "above_of", "by_threads", "crossed", "crossed_from", "mirrored",
     "path_lengths", "stretched", "wide",
 ]  # fmt: skip

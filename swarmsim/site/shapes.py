@@ -43,12 +43,6 @@ def stretched(way: Crossed, factors: jax.Array) -> Crossed:
     return replace(way, length_m=way.length_m * factors, shape=shape)
 
 
-def nothing_crossed(n: int, materials: int) -> Crossed:
-    """Of n segments that have no length."""
-    zero = jnp.zeros((n, materials))
-    return Crossed(length_m=zero, place=zero, shape=wide(zero, jnp.zeros((n, 2))))
-
-
 def wide(thin_m: jax.Array, ground: jax.Array) -> Shape:
     """That of infinite walls crossed squarely: ``thin_m`` [..., M], ``ground`` [..., 2]."""
     one = jnp.ones(thin_m.shape[:-1])
