@@ -1,5 +1,7 @@
 """Settings of the whole suite: CPU, a folder of its own for compiled programs, deterministic hypothesis."""
 
+import contextlib
+import ctypes
 import gc
 import os
 import signal
@@ -96,11 +98,19 @@ def programs_of_a_file(request: pytest.FixtureRequest) -> Iterator[None]:
     jax.config.update("jax_disable_most_optimizations", quickly)
     yield
     programs.forget()
+    _return_memory()
     if not _has_room():
         jax.clear_caches()
         gc.unfreeze()
     gc.collect()
     gc.freeze()  # what is left lives on, and is passed over by the next collection
+    _return_memory()
+
+
+def _return_memory() -> None:
+    """Give the system what compilers have freed: glibc keeps gigabytes of it, in pieces, and no room would be left."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _has_room() -> bool:

@@ -330,6 +330,7 @@ def _verdict(
         aerial,
         final,
         float(presumed.background_std),
+        (float(np.exp(presumed.log_activity)) * 1e-6, float(presumed.log_activity_std)),
     )
 
 

@@ -1,7 +1,7 @@
 """The sentence that says what a mission found, and why it is not to be believed where it is not."""
 
 from swarmsim.results.record import Estimate, Spectrum
-from swarmsim.results.status import Verdict
+from swarmsim.results.status import Verdict, in_mbq
 
 NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"
@@ -42,7 +42,7 @@ def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool,
 
 def _placed(estimate: Estimate) -> str:
     x, y = estimate.position_m[:2]
-    return f"{estimate.activity_mbq:.0f} MBq {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
+    return f"{in_mbq(estimate.activity_mbq)} {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
 
 
 def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str) -> str:

@@ -26,6 +26,7 @@ FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
 COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
 COMPANION_SHARE = 0.25  # of the stronger one's activity
+IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
@@ -58,6 +59,7 @@ def assess(
     aerial: Sequence[Estimate],
     final: Sequence[Estimate],
     background_std: float,
+    activity: tuple[float, float],
 ) -> Verdict:
     """Judge an answer.
 
@@ -70,6 +72,7 @@ def assess(
         aerial: sources by the survey's counts.
         final: sources by all counts, the surest first.
         background_std: how much a background may differ from place to place, of its logarithm.
+        activity: what is presumed of a source's, in MBq, and the standard deviation of its logarithm.
     """
     covered = coverage(samples, chart, ground_m)
     reasons = []
@@ -80,7 +83,7 @@ def assess(
     if covered < COVERED_SHARE:
         status = "incomplete_survey" if status in ("none", "located") else status
         reasons.append(f"only {covered:.0%} of the survey area was measured")
-    doubts = _doubts(chart, fit, aerial, final, background_std)
+    doubts = _doubts(chart, fit, aerial, final, background_std, activity)
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     reasons += [sentence for _, sentence in doubts]
@@ -116,7 +119,12 @@ def _saturated(samples: Samples, limits_cps: tuple[Floats, Floats]) -> bool:
 
 
 def _doubts(
-    chart: RadiationMap, fit: Fit, aerial: Sequence[Estimate], final: Sequence[Estimate], background_std: float
+    chart: RadiationMap,
+    fit: Fit,
+    aerial: Sequence[Estimate],
+    final: Sequence[Estimate],
+    background_std: float,
+    activity: tuple[float, float],
 ) -> list[tuple[Status, str]]:
     """Reasons not to believe the answer, the gravest first."""
     found: list[tuple[Status, str]] = []
@@ -140,8 +148,14 @@ def _doubts(
         if std > FAR_STD_M:
             found.append(("detected", f"the place of the {one.nuclide} source is known to {std:.0f} m only"))
     found += _companions(final)
+    found += _implausible(final, *activity)
     found += _unexplained(chart, final, background_std)
     return found
+
+
+def in_mbq(activity_mbq: float) -> str:
+    """An activity in words, with two digits at least: that of a faint source is not zero."""
+    return f"{activity_mbq:.0f} MBq" if activity_mbq >= 10.0 else f"{activity_mbq:.2g} MBq"
 
 
 def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
@@ -152,8 +166,21 @@ def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
             apart = float(np.linalg.norm(np.asarray(faint.position_m)[:2] - np.asarray(strong.position_m)[:2]))
             less = faint.activity_mbq < COMPANION_SHARE * strong.activity_mbq
             if faint.nuclide == strong.nuclide and less and apart < COMPANION_M:
-                text = f"the {faint.nuclide} source of {faint.activity_mbq:.2g} MBq {apart:.0f} m beside a stronger one"
+                text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.0f} m beside a stronger one"
                 found.append(("ambiguous", f"{text} may be an error of the model"))
+    return found
+
+
+def _implausible(final: Sequence[Estimate], presumed_mbq: float, std: float) -> list[tuple[Status, str]]:
+    """Sources far weaker or stronger than presumed: close to a vehicle a slight error of the model looks like one."""
+    found: list[tuple[Status, str]] = []
+    for one in final:
+        ratio = max(one.activity_mbq, 1e-12) / presumed_mbq
+        if abs(np.log(ratio)) > IMPLAUSIBLE_SIGMA * std:
+            times = float(f"{max(ratio, 1.0 / ratio):.2g}")
+            compared = f"{times:,.6g} times {'stronger' if ratio > 1.0 else 'weaker'}"
+            text = f"the {one.nuclide} source of {in_mbq(one.activity_mbq)} is {compared} than presumed"
+            found.append(("ambiguous", f"{text} (knowledge.activity_mbq), and may be an error of the model"))
     return found
 
 

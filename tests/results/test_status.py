@@ -46,6 +46,7 @@ def verdict(
     return assess(
         samples, chart(hotspots, rate), limits, np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
+        (100.0, float(np.log(10.0))),
     )  # fmt: skip
 
 
@@ -72,6 +73,16 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"final": (estimate(), estimate(20.0, std=14.0, nuclide="Cs-137"))}, "detected", "Cs-137 source is known to"),
         ({"hotspots": ((0.0, 0.0), (-28.0, 0.0))}, "ambiguous", "further sources"),
         ({"final": (estimate(), estimate(6.0, activity=20.0))}, "ambiguous", "20 MBq 6 m beside a stronger one"),
+        (
+            {"final": (estimate(), estimate(9.0, activity=0.02, nuclide="I-131"))},
+            "ambiguous",
+            "of 0.02 MBq is 5,000 times weaker",
+        ),
+        (
+            {"final": (estimate(), estimate(9.0, activity=2e6, nuclide="I-131"))},
+            "ambiguous",
+            r"stronger than presumed \(knowledge.activity_mbq\)",
+        ),
     ],
 )
 def test_each_doubt_has_its_status_and_sentence(given, status: str, said: str) -> None:

@@ -235,6 +235,21 @@ def test_an_end_that_is_no_number_hides_nothing_from_its_neighbours():
     assert expected[:, CONCRETE].min() > 0.9
 
 
+def test_what_is_wanted_is_crossed_as_if_all_were():
+    site = make_site([((5.0, 0.0, 1.0), (0.5, 20.0, 3.0), 0.0, 0.0, "concrete")])
+    start = jnp.array([0.0, 0.0, 1.0])
+    ends = jnp.array([[10.0, y, 1.0] for y in np.linspace(-3.0, 3.0, 53)], jnp.float32)
+    wanted = (jnp.arange(53) % 5 == 0) & ((jnp.arange(53) < 16) | (jnp.arange(53) >= 32))
+    found = jax.jit(lambda wanted: crossed_from(site, start, ends, wanted))
+    some, every = found(wanted), jax.jit(lambda: crossed_from(site, start, ends))()
+    for one, other in zip(jax.tree.leaves(some), jax.tree.leaves(every), strict=True):
+        np.testing.assert_array_equal(np.asarray(one)[wanted], np.asarray(other)[wanted])
+    between = slice(16, 32)  # a block of its own
+    assert np.all(np.asarray(some.length_m)[between] == 0.0)
+    assert np.all(np.asarray(some.shape.share)[between] == 1.0)
+    assert np.all(np.asarray(every.length_m)[between, CONCRETE] > 0.9)
+
+
 def shape_of(site, a, b):
     way = crossed_of(site, jnp.array(a, jnp.float32), jnp.array(b, jnp.float32))
     return float(way.length_m[CONCRETE]), float(way.shape.thin_m[CONCRETE]), way.shape
