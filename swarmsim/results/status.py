@@ -26,6 +26,7 @@ FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
 COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
 COMPANION_SHARE = 0.25  # of the stronger one's activity
+ONE_M = 3.0  # within it two sources of whatever activities may be one that walls blur
 IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
@@ -159,14 +160,15 @@ def in_mbq(activity_mbq: float) -> str:
 
 
 def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
-    """Faint sources beside a strong one of the same nuclide: errors of the model of walls look like them."""
+    """Faint sources beside a strong one of the same nuclide, or any two at one place: errors of the model of walls."""
     found: list[tuple[Status, str]] = []
-    for faint in final:
-        for strong in final:
+    for k, faint in enumerate(final):
+        for strong in [*final[:k], *final[k + 1 :]]:
             apart = float(np.linalg.norm(np.asarray(faint.position_m)[:2] - np.asarray(strong.position_m)[:2]))
-            less = faint.activity_mbq < COMPANION_SHARE * strong.activity_mbq
-            if faint.nuclide == strong.nuclide and less and apart < COMPANION_M:
-                text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.0f} m beside a stronger one"
+            share = faint.activity_mbq / max(strong.activity_mbq, 1e-12)
+            near = apart < COMPANION_M if share < COMPANION_SHARE else share <= 1.0 and apart < ONE_M
+            if faint.nuclide == strong.nuclide and near:
+                text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside a stronger one"
                 found.append(("ambiguous", f"{text} may be an error of the model"))
     return found
 
