@@ -4,8 +4,9 @@ For a place of one source the following are unknown besides, and fitted together
 
 - the activity of that source, and those of the others;
 - the level of each detector model's background, and its deviation in every window (a normal prior of its logarithm);
-- a factor of the path length in each material (a normal prior of its logarithm);
-- a common factor of what the sources add in every window: what the model does not know of scattering, poses and walls.
+- a factor of the path length in each uncertain material (a normal prior of its logarithm);
+- in every window a factor of what all sources add (Student's t of its logarithm): what the model does not know of
+  scattering, poses and walls.
 
 What belongs to one window is eliminated there (Schur complement), so that the cost grows with the windows and not with
 their square. The value at a place is the logarithm of the posterior after all of them are integrated out (Laplace's

@@ -19,7 +19,7 @@ class Measurements:
     counts: jax.Array  # [n] counts in the interval
     exposure_s: jax.Array  # [n] s, live time that the counts stand for
     valid: jax.Array  # [n] bool
-    detector: jax.Array  # [n] int32, index into the tuple of detectors (UAV, rover)
+    detector: jax.Array  # [n] int32, index into the tuple of detector models
     rois: jax.Array | None = None  # [n, R] the counts by region of interest
     chord_m: jax.Array | None = None  # [n, 3] middle of the straight line between the ends of the way, less position_m
 

@@ -59,7 +59,7 @@ class Candidates:
 
 
 def attempt(problem: Problem, nuclide: jax.Array, others: Others, u: Unknowns, place: jax.Array) -> Tried:
-    """The fit at a place [3] from the unknowns ``u``, of which the activity is not used."""
+    """The fit at a place [3] from the unknowns ``u``: from the levels and the others' factors alone."""
     # lengths that a wrong place asked for would make others look wrong
     u = replace(u, lengths=jnp.zeros_like(u.lengths))
     fit = settle(problem, ways_from(problem, place), nuclide, others, u, STEPS, fresh=True)

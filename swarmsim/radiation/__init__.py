@@ -1,4 +1,4 @@
-"""Gamma radiation: nuclides, attenuation and build-up, detector response, counts, spectra and identification.
+"""Gamma radiation: nuclides, attenuation and scattered photons, detector response, counts, spectra and identification.
 
 Nuclides, materials and detectors are files in ``configs``; the code names none of them, apart from air.
 """

@@ -236,7 +236,7 @@ def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Face
 
 
 def _seen(faces: _Faces, nodes_of_edge: int, k: Constants) -> list[jax.Array]:
-    """What source and detector see of each face [6, n], at each of `DEPTHS`."""
+    """What source and detector see of each face [3, n], at each of `DEPTHS`."""
     s, d = jnp.abs(faces.source) + _LEAST_M, jnp.abs(faces.detector) + _LEAST_M
     near, far = s * s, d * d
     for low, high, foot in zip(faces.low, faces.high, faces.foot, strict=True):

@@ -58,7 +58,7 @@ def test_the_paper_mission_differs_in_detector_background_and_knowledge_only() -
     assert paper.knowledge.site == "exact"
     assert paper.knowledge.pose_std_m == paper.knowledge.sensitivity_std == 0.0
     changes = {"name": "recon_paper", "detection": "paper_ideal", "background": paper.background}
-    changes["knowledge"] = paper.knowledge
+    changes |= {"knowledge": paper.knowledge, "description": paper.description}
     assert paper == physical.model_copy(update=changes)
 
 

@@ -50,7 +50,7 @@ def run(
     force
         Replace the results of an earlier run.
     strict
-        End with 3 where a mission's status is neither located nor none. (2 is wrong input.)
+        End with 3 where a mission's status is neither located nor none, and it seeks sources. (2 is wrong input.)
     """
     from swarmsim.cli.run import run_scenario
 
