@@ -1,8 +1,9 @@
 """Likelihood of detector counts for one point source: forward model, score and Fisher information.
 
 The parameters are theta = (x, y, height above the ground, log activity in Bq, log background scale). Counts are
-Poisson with mean exposure * observed_rate(activity * r + extra + (scale - 1) * background), r being the detector's
-net rate per becquerel through the known site; the background scale multiplies every detector's nominal background.
+Poisson with mean exposure * observed_rate(activity * r + extra + (scale * n - 1) * background), r being the detector's
+net rate per becquerel through the known site and n the natural background at the window's height over the nominal one;
+the background scale multiplies every detector's nominal background.
 """
 
 from functools import partial

@@ -1,9 +1,10 @@
 """Count rate of one detector from one point source, dead time, and drawn counts (device side).
 
-    rate = sum over lines of  A y A_eff(E, theta) G / (4 pi (r^2 + S^2)) (exp(-t) + scattered(t)),  t = sum mu_k x_k
+    rate = sum over lines of  A y A_eff(E, theta) G / (4 pi (r^2 + S^2)) (exp(-t) + scattered(t)) (1 + g)
 
 with activity A, effective area A_eff (the integral of the detection probability over the silhouette), near-field ratio
-G (`swarmsim.radiation.cylinder`), and the scattered counts of `swarmsim.radiation.walls`.
+G (`swarmsim.radiation.cylinder`), depth t = sum mu_k x_k, the scattered counts of `swarmsim.radiation.walls`, and the
+share g that the ground adds (`swarmsim.radiation.ground`).
 """
 
 import jax
