@@ -61,3 +61,9 @@ def test_several_sources_and_doubts_are_told():
     assert said.startswith("ambiguous: 2 sources: of ")
     assert "Cs-137 at (20.0" in said
     assert said.endswith("; but a; b")
+
+
+def test_the_activity_of_a_faint_source_is_not_zero():
+    for activity, said in ((0.0107, "0.011 MBq"), (9.96, "10 MBq"), (170.4, "170 MBq")):
+        faint = (estimate(activity=activity),)
+        assert f"a source of {said} Co-60" in finding(SURE, faint, None, no_way=False, presumed=False)

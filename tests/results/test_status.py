@@ -73,6 +73,7 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"final": (estimate(), estimate(20.0, std=14.0, nuclide="Cs-137"))}, "detected", "Cs-137 source is known to"),
         ({"hotspots": ((0.0, 0.0), (-28.0, 0.0))}, "ambiguous", "further sources"),
         ({"final": (estimate(), estimate(6.0, activity=20.0))}, "ambiguous", "20 MBq 6 m beside a stronger one"),
+        ({"final": (estimate(), estimate(0.3, activity=95.0))}, "ambiguous", "95 MBq 0.3 m beside a stronger one"),
         (
             {"final": (estimate(), estimate(9.0, activity=0.02, nuclide="I-131"))},
             "ambiguous",
@@ -103,7 +104,13 @@ def test_a_source_that_the_survey_did_not_show_is_compared_with_none() -> None:
 
 @pytest.mark.parametrize(
     "other",
-    [{"x": 15.0, "activity": 20.0}, {"x": 6.0, "activity": 90.0}, {"x": 6.0, "activity": 20.0, "nuclide": "I-131"}],
+    [
+        {"x": 4.0, "activity": 90.0},
+        {"x": 0.3, "nuclide": "I-131"},
+        {"x": 15.0, "activity": 20.0},
+        {"x": 6.0, "activity": 90.0},
+        {"x": 6.0, "activity": 20.0, "nuclide": "I-131"},
+    ],
 )
 def test_companions_that_walls_do_not_explain_are_no_doubt(other) -> None:
     assert verdict(final=(estimate(), estimate(**other))).status == "located"
