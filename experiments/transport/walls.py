@@ -32,7 +32,7 @@ from swarmsim.site.surfaces import Box, Constants, constants, scattered_share
 ENERGIES = (60.0, 122.0, 356.0, 662.0, 1332.0), (0.1, 0.2, 0.2, 0.25, 0.25)  # and how often they are drawn
 MATERIALS = ("concrete", "brick", "steel", "lead"), (0.4, 0.25, 0.25, 0.1)
 THICKNESS_M = {"concrete": (0.04, 0.3), "brick": (0.08, 0.36), "steel": (0.001, 0.02), "lead": (0.001, 0.02)}
-RUNS = {"inside": 30, "container": 8, "cube": 4, "wall": 24, "square": 3, "behind": 14}  # of each seed
+RUNS = {"inside": 30, "container": 8, "cube": 4, "wall": 24, "square": 3, "behind": 14, "block": 12}  # of each seed
 TOLD = {
     "inside": "in a closed building",
     "container": "in a container of steel",
@@ -40,9 +40,10 @@ TOLD = {
     "wall": "a free-standing wall between",
     "square": "a wide wall between, crossed squarely",
     "behind": "a closed building between",
+    "block": "a solid block between",
 }
 ENCLOSED = ("inside", "container", "cube")  # the source
-SOLID = ("wall", "square")
+SOLID = ("wall", "square", "block")
 VIEWS = 8
 COLLISIONS = 30
 POSITIVE = (
@@ -109,6 +110,8 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
         x = y = z = 1.0 + thickness
     elif kind == "square":
         y, z = between(8.0, 15.0), between(8.0, 15.0)
+    elif kind == "block":
+        x, y, z = (between(0.5, 4.0) * THICKNESS_M[material][1] for _ in range(3))
     low, high = np.array([-x, -y, -z if kind in ("cube", "square") else 0.0]), np.array([x, y, z])
     if kind == "cube":
         source = np.zeros(3)
@@ -118,8 +121,8 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
         source = rng.uniform(least + margin, most - margin)
         if rng.random() < 0.5:
             source[2] = least[2] + min(0.5, 0.4 * (most[2] - least[2]))
-    elif kind == "behind":
-        source = np.array([-x - between(0.3, 8.0), rng.uniform(-y, y), rng.uniform(0.3, min(2.0, z))])
+    elif kind in ("behind", "block"):
+        source = np.array([-x - between(0.3, 8.0), rng.uniform(-y, y), rng.uniform(min(0.3, 0.5 * z), min(2.0, z))])
     else:
         if rng.random() < 0.5:
             thickness = between(0.5, 1.5) * THICKNESS_M[material][1] / 2
@@ -143,6 +146,9 @@ def _beyond(rng: np.random.Generator, kind: str, source: Floats, box: Floats) ->
         if kind == "square":
             azimuth, elevation = rng.uniform(-0.2, 0.2, 2)
         way = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        if kind == "block":  # too small to be met by chance
+            way = rng.uniform(*box) - source
+            way /= np.linalg.norm(way)
         ends = np.sort((box - source) / np.where(np.abs(way) < 1e-9, 1e-9, way), axis=0)
         if ends[1].min() > max(ends[0].max(), 0.0):
             distance = float(np.exp(rng.uniform(np.log(1.0), np.log(30.0))))
@@ -240,7 +246,7 @@ def deviations(found: list[Case], lines: Floats, way: Crossed, detector: Detecto
 
         def one(number: jax.Array, way: Crossed) -> jax.Array:
             tables = (detector.attenuation_1_m, detector.scatter_1_m, detector.line_energy_kev)
-            return scattered_counts(*(x[number] for x in tables), None, way, k).counts[0]
+            return scattered_counts(*(x[number] for x in tables), detector.surrounds, way, k).counts[0]
 
         return jnp.log((direct + jax.vmap(one)(number, seen)) / (direct + scattered))
 

@@ -53,6 +53,7 @@ def coarse(detector: Detector, lines: int, materials: tuple[str, ...]) -> Detect
         effective_area_m2=f32(by_yield @ area),
         near_share=f32(averaged("near_share", 0)),
         attenuation_1_m=f32(averaged("attenuation_1_m", 0)[..., columns]),
+        surrounds=f32(np.asarray(detector.surrounds)[columns]),
         scatter_1_m=f32(averaged("scatter_1_m", 2)[..., columns]),
         peak_spectrum=f32(np.ones((len(energy), most, 1))),
         peak_orders=f32(np.zeros((len(energy), most, 1, 1, 1))),

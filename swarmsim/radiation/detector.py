@@ -38,6 +38,7 @@ from swarmsim.radiation.response import (
     normalised,
 )
 from swarmsim.radiation.strangers import others_than, spectra_of
+from swarmsim.site.model import SURROUNDING_KG_M3
 
 Floats = NDArray[np.float64]
 
@@ -73,6 +74,7 @@ class Detector:
     near: jax.Array  # [NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS] of cylinder.near_ratio
     near_share: jax.Array  # [N, L, NEAR_TABLES] weights of the tables for each line
     attenuation_1_m: jax.Array  # [N, L, M]
+    surrounds: jax.Array  # [M] 1 for materials that are no walls (air, leaves), else 0
     scatter_1_m: jax.Array  # [N, positions, COEFFICIENTS, L, M] attenuation times coefficients of scattered counts
     ground: jax.Array  # [N, L, 2] coefficients of the counts from the ground (`swarmsim.radiation.ground`)
     peak_spectrum: jax.Array  # [N, L, channels] share of the counts of unscattered photons in each channel, sums to 1
@@ -151,6 +153,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         near=f32(near_tables(radius, length, nodes)),
         near_share=f32(_shares(np.log(mu), np.log(nodes))),
         attenuation_1_m=f32(attenuation),
+        surrounds=f32(surrounding(library)),
         scatter_1_m=f32(coefficients),
         scattered_bins=f32(bins),
         ground=f32(ground),
@@ -217,6 +220,11 @@ def _shares(value: Floats, nodes: Floats) -> Floats:
     """Weights [..., k] of linear interpolation between ``nodes`` [k], constant beyond them."""
     place = np.interp(value, nodes, np.arange(len(nodes), dtype=float))
     return np.asarray(np.maximum(1.0 - np.abs(place[..., None] - np.arange(len(nodes))), 0.0))
+
+
+def surrounding(library: Library) -> Floats:
+    """1 for the materials [M] that are no walls, else 0."""
+    return np.array([float(material.density_kg_m3 < SURROUNDING_KG_M3) for material in library.materials])
 
 
 def _transport(

@@ -9,7 +9,7 @@ from swarmsim.config.radiation import Nuclide
 from swarmsim.pytree import on_device
 from swarmsim.radiation import scattering
 from swarmsim.radiation.cylinder import NEAR_COLUMNS, NEAR_ROWS, NEAR_TABLES
-from swarmsim.radiation.detector import Detector, lines_of
+from swarmsim.radiation.detector import Detector, lines_of, surrounding
 from swarmsim.radiation.ground import from_ground
 from swarmsim.radiation.library import Library
 from swarmsim.radiation.lines import SPECTRUM_BINS
@@ -74,6 +74,7 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
         near=f32(np.ones((NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS))),
         near_share=f32(np.full((*energy.shape, NEAR_TABLES), 1 / NEAR_TABLES)),
         attenuation_1_m=f32(tables.attenuation_1_m[tables.row]),
+        surrounds=f32(surrounding(library)),
         scatter_1_m=f32(np.moveaxis(tables.scatter_1_m[tables.row], 1, 3)),
         ground=f32(ground[tables.row]),
         ground_bins=f32(np.full((*energy.shape, SPECTRUM_BINS), 1 / SPECTRUM_BINS)),

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.radiation.cylinder import direction_basis, near_ratio
-from swarmsim.radiation.detector import AIR, Detector, Source
+from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.lines import SPECTRUM_DEPTHS
 from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.walls import Scattered, scattered_counts
@@ -62,9 +62,8 @@ def transmission(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[
 
 
 def _scattered(detector: Detector, nuclide: jax.Array, way: Crossed) -> Scattered:
-    air = detector.material_names.index(AIR) if AIR in detector.material_names else None
     tables = (detector.attenuation_1_m[nuclide], detector.scatter_1_m[nuclide], detector.line_energy_kev[nuclide])
-    return scattered_counts(*tables, air, way)
+    return scattered_counts(*tables, detector.surrounds, way)
 
 
 def _seen(detector: Detector, source: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
@@ -74,7 +73,8 @@ def _seen(detector: Detector, source: Source, position_m: jax.Array, axis: jax.A
     distance = jnp.sqrt(squared + 1e-12)
     u = jnp.abs(jnp.dot(offset, axis)) / distance
     across = jnp.cross(offset, axis) / distance
-    s = jnp.sqrt(jnp.sum(across * across) + 1e-10)  # keeps the gradient finite on the axis
+    # the gradient is finite on the axis, and in the crystal's centre it is seen from the side
+    s = jnp.sqrt(jnp.sum(across * across) + 1e-10 + 1e-12 / (squared + 1e-12))
     reach2 = detector.radius_m**2 + 0.25 * detector.length_m**2
     near = near_ratio(detector.near, distance / jnp.sqrt(reach2), u, s)
     area = detector.effective_area_m2[source.nuclide] @ direction_basis(u, s)
@@ -210,9 +210,7 @@ def roi_rates_and_slopes(
     rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
     slants = found.slant_layers[..., chosen]  # [n, L, U]
     changes = layers[..., chosen] * found.by_depth[..., None]
-    if AIR in detector.material_names:
-        air = chosen == detector.material_names.index(AIR)
-        changes -= jnp.where(air, layers[..., chosen] * found.by_walls[..., None], 0.0)
+    changes -= detector.surrounds[chosen] * layers[..., chosen] * found.by_walls[..., None]
     of_scattered = (seen[..., None] * changes)[..., None] * shares[:, :, None]
     return rates, jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[:, :, None], axis=1)
 

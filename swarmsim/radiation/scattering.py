@@ -22,6 +22,7 @@ from swarmsim.config.files import packaged_dir
 from swarmsim.config.radiation import Material
 from swarmsim.radiation.attenuation import coefficients, linear_attenuation
 from swarmsim.radiation.elements import CUT_KEV
+from swarmsim.site.model import SURROUNDING_KG_M3
 
 Floats = NDArray[np.float64]
 
@@ -33,8 +34,6 @@ COEFFICIENTS = 4
 DEPTH_SCALES = (0.2, 3.0)
 DEPTH_MAX = 15.0
 """Mean free paths up to which the tables reach; deeper, the build-up stays as it is there."""
-SURROUNDING_KG_M3 = 10.0
-"""A lighter material (air, leaves) surrounds source and detector; a denser one is a wall between them."""
 _AIR = "air"
 _WALLS = ("water", "concrete", "steel", "tin", "lead")
 _REFERENCE_KEV = 100.0

@@ -26,6 +26,7 @@ from swarmsim.site.rays import Crossed
 from swarmsim.site.surfaces import DEPTHS, Constants, constants
 
 REFERENCE_KEV = 662.0
+_LEAST_M = 1e-6
 
 
 class Scattered(NamedTuple):
@@ -44,7 +45,7 @@ def scattered_counts(
     attenuation_1_m: jax.Array,
     scatter_1_m: jax.Array,
     energy_kev: jax.Array,
-    air: int | None,
+    surrounds: jax.Array,
     way: Crossed,
     k: Constants | None = None,
 ) -> Scattered:
@@ -52,14 +53,14 @@ def scattered_counts(
 
     Behind several layers with depths t_k it is that of the depth sum(t_k), with coefficients averaged over the layers
     with weights t_k; each layer's lie between those of a wall near the source and of one half way. Derivatives leave
-    out that the weights of walls among each other change, and take what changes for a wall: for air, ``by_walls`` is to
-    be taken off ``by_depth``.
+    out that the weights of walls among each other change, and take what changes for a wall: for a material that
+    surrounds, ``by_walls`` is to be taken off ``by_depth``.
 
     Args:
         attenuation_1_m: [L, M].
         scatter_1_m: [positions, COEFFICIENTS, L, M], see `Detector`.
         energy_kev: [L] of the lines.
-        air: number of the material that is no wall.
+        surrounds: [M] 1 for materials that are no walls (air, leaves), else 0.
         way: what the line crosses.
         k: those of the project's table by default.
     """
@@ -78,14 +79,14 @@ def scattered_counts(
     steep = c[1] + c[2] / (DEPTH_SCALES[0] + t) + c[3] / (DEPTH_SCALES[1] + t)
     rise = jnp.where(depth < DEPTH_MAX, depth * steep, 0.0)  # of the growth, by ln(depth)
     rising = 1.0 + rise - depth  # of the logarithm of all, by ln(depth)
-    of_walls, mixed = jnp.ones_like(depth), jnp.zeros_like(depth)  # the growth's derivative by the part that is walls
-    if air is not None:
-        of_walls = 1.0 - layers[..., air] / (depth + 1e-9)
-        # a nuclide with fewer lines than others has some without attenuation
-        p = scatter_1_m[..., air] / jnp.maximum(attenuation_1_m[:, air], 1e-9)  # [positions, COEFFICIENTS, L]
-        q = [near[..., air, None] * p[0, j] + (1.0 - near[..., air, None]) * p[1, j] for j in range(p.shape[1])]
-        apart = growth - (q[0] + q[1] * t + q[2] * logs[0] + q[3] * logs[1])
-        mixed = jnp.where(of_walls > 1e-3, apart / jnp.maximum(of_walls, 1e-3), 0.0)
+    of_walls = 1.0 - jnp.sum(layers * surrounds, axis=-1) / (depth + 1e-9)
+    # the growth's derivative by the part that is walls; where nothing surrounds, as of a micrometre of what could
+    around = jnp.stack([near, 1.0 - near], axis=-2) * (surrounds * (thin_m[..., None, :] + _LEAST_M))
+    shares = jnp.einsum("pclm,...pm->...cl", scatter_1_m, around)
+    # a nuclide with fewer lines than others has some without attenuation
+    q = shares / jnp.maximum(jnp.einsum("lm,...pm->...l", attenuation_1_m, around), 1e-30)[..., None, :]
+    apart = growth - (q[..., 0, :] + q[..., 1, :] * t + q[..., 2, :] * logs[0] + q[..., 3, :] * logs[1])
+    mixed = jnp.where(of_walls > 1e-3, apart / jnp.maximum(of_walls, 1e-3), 0.0)
     if way.shape is None:
         falling = jnp.exp(growth - depth)
         by_depth = falling * (rising + (1.0 - of_walls) * mixed)

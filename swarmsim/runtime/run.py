@@ -23,7 +23,9 @@ def build(scenario: Scenario) -> Simulation:
     No setting of the process is changed (see `swarmsim.use_all_cores`). Raises `InputError` with everything that is
     wrong.
     """
-    site_model = load_site(scenario.site_file, tuple(scenario.materials))
+    site_model = load_site(
+        scenario.site_file, tuple(scenario.materials), [m.density_kg_m3 for m in scenario.materials.values()]
+    )
     raise_if_any(check_site(scenario, site_model))
     simulation = Simulation(scenario, site_model)
     simulation.check_family()

@@ -1,5 +1,6 @@
 """Ground truth of a site: device arrays (rasters, obstacles), and the host-side model with its visual mesh."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 from swarmsim.config.site import SiteSpec
 from swarmsim.pytree import pytree, static
 from swarmsim.site.terrain_crossing import Ceilings
+
+SURROUNDING_KG_M3 = 10.0
+"""A lighter material (air, leaves) surrounds source and detector; a denser one is a wall between them."""
 
 
 @pytree
@@ -53,6 +57,8 @@ class Site:
     ground_material: jax.Array  # [] int32 index into material_names
     steps: Steps | None = None  # None: the ground has no steps
     above: Ceilings | None = None  # of the terrain; None: made where it is needed
+    wall_kg_m3: jax.Array | None = None  # [M] bulk density of what can be a wall, 0 of air and leaves, see
+    # `SURROUNDING_KG_M3`; None: boxes of every material count by their metres
     material_names: tuple[str, ...] = static()  # order of the materials table
 
 
@@ -74,6 +80,12 @@ class SiteModel:
     site: Site
     mesh: VisualMesh
     report: dict[str, Any]  # area_m2, relief_m, obstacles, filled_cells, warnings … (plain JSON values)
+
+
+def walls_among(densities_kg_m3: Sequence[float]) -> NDArray[np.float64]:
+    """``Site.wall_kg_m3`` [M] of materials with these bulk densities."""
+    densities = np.array(densities_kg_m3, np.float64)
+    return np.where(densities < SURROUNDING_KG_M3, 0.0, densities)
 
 
 def _cells_of(site: Site, raster: jax.Array) -> tuple[jax.Array, jax.Array]:

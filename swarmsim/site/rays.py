@@ -14,16 +14,17 @@ from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site, sample
 from swarmsim.site.shapes import (
     Crossed,
-    Longest,
+    Most,
     Shape,
     Way,
     in_axes,
     key_of,
-    longest,
+    most_of,
     nothing_met,
     of_both,
     shaped,
     stretched,
+    walls_of_materials,
     wide,
 )
 from swarmsim.site.surfaces import matter, part_inside, slabs
@@ -49,13 +50,13 @@ def crossed(site: Site, a: jax.Array, b: jax.Array) -> Crossed:
     Boxes are intersected exactly (slab method, Kay and Kajiya, SIGGRAPH 1986); of a hollow box, only the shell counts.
     The terrain is crossed exactly too (`swarmsim.site.terrain_crossing`). Lengths are continuous in both ends and
     differentiable almost everywhere; of the rest ``thin_m`` and ``ground`` are, the others are constants to
-    derivatives. The ``shape`` knows two boxes, those with the longest short ways; others count as wide walls, and the
-    two do so too as far as a third is as long. Where obstacles overlap, the lengths are scaled so that their sum does
+    derivatives. The ``shape`` knows three boxes, those with the most matter the short way, and others count as these.
+    Where obstacles overlap, the lengths are scaled so that their sum does
     not exceed the distance. The remaining distance is that through ``air`` if the table has it, and then the sum equals
     the distance.
     """
     way = _way(site, above_of(site), a, b)
-    every = shaped(site.obstacles, a[None], b[None], jax.tree.map(lambda x: x[None], way))
+    every = shaped(site.obstacles, walls_of_materials(site), a[None], b[None], jax.tree.map(lambda x: x[None], way))
     return jax.tree.map(lambda x: x[0], every)
 
 
@@ -72,9 +73,10 @@ def _way(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes 
     fractions, moments, thin = found.share, found.moment, found.thin
     # A function with its own derivative takes no arrays of the host, as the values of a world are: add nothing to them.
     soil, soil_place = share_below(site, above, jnp.add(a, 0.0), jnp.add(b, 0.0))
-    ground = materials == site.ground_material
+    ground, of_metre = materials == site.ground_material, walls_of_materials(site)
+    in_boxes = jax.lax.stop_gradient(distance * jnp.sum(thin * of_metre))
     fractions, thin = (x + jnp.where(ground, soil, 0.0) for x in (fractions, thin))
-    walls = jnp.maximum(jnp.sum(thin), 1e-9)
+    in_all = jax.lax.stop_gradient(distance * jnp.sum(thin * of_metre))
     moments = moments + jnp.where(ground, jax.lax.stop_gradient(soil * soil_place), 0.0)
     place = jnp.where(fractions > 1e-9, moments / jnp.maximum(fractions, 1e-9), 0.5)
     total = jnp.sum(fractions)
@@ -85,9 +87,7 @@ def _way(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes 
     place = jax.lax.stop_gradient(jnp.clip(place, 0.0, 1.0))
     crossed = Crossed(length_m=distance * fractions, place=place)
     thin_m, ground = distance * thin, mirrored(site, a, b)
-    return Way(
-        crossed=crossed, thin_m=thin_m, ground=ground, walls_m=jax.lax.stop_gradient(distance * walls), met=found.met
-    )
+    return Way(crossed=crossed, thin_m=thin_m, ground=ground, boxes=in_boxes, walls=in_all, met=found.met)
 
 
 def _length(vector: jax.Array) -> jax.Array:
@@ -158,7 +158,7 @@ def _in_blocks(site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None 
             lambda x: jax.lax.cond(jnp.any(x[1]), block, lambda _: unseen, x[0]), (ends, parts)
         )  # fmt: skip
     ways = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], ways)
-    return shaped(every, jnp.broadcast_to(a, b.shape), b, ways, PAIRS)
+    return shaped(every, walls_of_materials(site), jnp.broadcast_to(a, b.shape), b, ways, PAIRS)
 
 
 def _met(
@@ -202,8 +202,9 @@ def _of_box(
 ) -> "_Found":
     """What a segment crosses of one ``box`` [1]; nothing unless it ``meets`` it."""
     lengths = [jnp.where(meets, x, 0.0) for x in _of_boxes(box, a, direction, distance)]
-    met = replace(nothing_met(), first=key_of(jax.lax.stop_gradient(lengths[2][0]), number))
     own = box.material == jnp.arange(len(site.material_names), dtype=jnp.int32)
+    of_metre = jnp.sum(jnp.where(own, walls_of_materials(site), 0.0))
+    met = replace(nothing_met(), first=key_of(jax.lax.stop_gradient(distance * lengths[2][0] * of_metre), number))
     share, moment, thin = (jnp.where(own, x, 0.0) for x in lengths)
     return _Found(share=share, moment=moment, thin=thin, met=met)
 
@@ -260,13 +261,17 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
     ``platform`` is that of `swarmsim.scalars.over_vehicles`.
     """
     above = above_of(site)
-    needed = (site.obstacles, site.terrain_m, site.origin_m, site.cell_m, site.ground_material)
+    of_metre = walls_of_materials(site)
+    needed = (site.obstacles, of_metre, site.terrain_m, site.origin_m, site.cell_m, site.ground_material)
     nothing, shapes = np.zeros(1, np.float32), above.shapes
     bare = jax.tree.map(lambda _: nothing, site)
 
     def one(end: jax.Array, start: jax.Array, needed: Any, heights: tuple[jax.Array, jax.Array]) -> Way:
-        boxes, terrain, origin, cell, ground = needed
-        here = replace(bare, obstacles=boxes, terrain_m=terrain, origin_m=origin, cell_m=cell, ground_material=ground)
+        boxes, metre, terrain, origin, cell, ground = needed
+        here = replace(
+            bare, obstacles=boxes, wall_kg_m3=metre, terrain_m=terrain, origin_m=origin, cell_m=cell,
+            ground_material=ground,
+        )  # fmt: skip
         ceiling = Ceilings(highest_m=heights[0], around_m=heights[1], shapes=shapes)
         return _way(here, ceiling, start, end, _box_after_box)
 
@@ -274,7 +279,7 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
     ways: Way = over_vehicles(one, (0, 0, None, None), platform=platform)(
         b, starts, needed, (above.highest_m, above.around_m)
     )
-    return shaped(site.obstacles, starts, b, ways)
+    return shaped(site.obstacles, of_metre, starts, b, ways)
 
 
 @pytree
@@ -284,7 +289,7 @@ class _Found:
     share: jax.Array
     moment: jax.Array  # integral of the place over the part inside
     thin: jax.Array  # the shortest way through each box's matter
-    met: Longest
+    met: Most
 
 
 def _nothing_found(materials: int) -> _Found:
@@ -310,7 +315,10 @@ def _all_boxes(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Arr
     # Matrix product: a masked sum would dominate the cost.
     stacked = jnp.stack([share, jax.lax.stop_gradient(moment), thin])
     sums = jnp.dot(stacked, one_hot, precision=jax.lax.Precision.HIGHEST)
-    return _Found(share=sums[0], moment=sums[1], thin=sums[2], met=longest(jax.lax.stop_gradient(thin)))
+    of_metre = jnp.take(walls_of_materials(site), site.obstacles.material, mode="clip")
+    return _Found(
+        share=sums[0], moment=sums[1], thin=sums[2], met=most_of(jax.lax.stop_gradient(distance * thin * of_metre))
+    )
 
 
 def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:

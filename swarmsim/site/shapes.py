@@ -1,4 +1,4 @@
-"""What decides how walls scatter photons along a segment: its two boxes with the longest short ways.
+"""What decides how walls scatter photons along a segment: its three boxes with the most matter the short way.
 
 `swarmsim.site.rays` finds them; `shaped` computes what they scatter (`swarmsim.site.surfaces`), for those segments
 alone that meet any.
@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.pytree import pytree
-from swarmsim.site.model import Obstacles
-from swarmsim.site.surfaces import DEPTHS, Box, scattered_share, thin_m_of
+from swarmsim.site.model import Obstacles, Site
+from swarmsim.site.surfaces import DEPTHS, Box, scattered_share
 
 _UPPER = -(1 << 16)  # mask of a number's upper half
+ALIKE = 0.05
+"""Weight of a box beside three others of the same matter, over that of a box alone."""
 
 
 @pytree
@@ -52,35 +54,40 @@ def wide(thin_m: jax.Array, ground: jax.Array) -> Shape:
 
 
 @pytree
-class Longest:
-    """The three boxes with the longest short ways, for segments [...]: see `key_of`; 0 for none."""
+class Most:
+    """The three boxes with the most matter the short way, for segments [...]: see `key_of`; 0 for none."""
 
     first: jax.Array  # [...] int32
     second: jax.Array
     third: jax.Array
 
 
-def key_of(thin: jax.Array, number: jax.Array) -> jax.Array:
-    """A number that grows with ``thin`` [...] >= 0 to 1 %, and holds the box's ``number`` in its lower half."""
-    bits = jax.lax.bitcast_convert_type(thin, jnp.int32)  # it grows with the value
-    return jnp.where(thin > 0.0, (bits & _UPPER) | number, 0)
+def key_of(matter: jax.Array, number: jax.Array) -> jax.Array:
+    """A number that grows with ``matter`` [...] >= 0 to 1 %, and holds the box's ``number`` in its lower half."""
+    bits = jax.lax.bitcast_convert_type(matter, jnp.int32)  # it grows with the value
+    return jnp.where(matter > 0.0, (bits & _UPPER) | number, 0)
 
 
-def of_both(one: Longest, other: Longest) -> Longest:
+def walls_of_materials(site: Site) -> jax.Array:
+    """What a metre of each material [M] counts among walls: its bulk density, 0 of what is none."""
+    return jnp.ones(len(site.material_names)) if site.wall_kg_m3 is None else jnp.asarray(site.wall_kg_m3)
+
+
+def of_both(one: Most, other: Most) -> Most:
     """The same of the boxes of either."""
     lower, seconds = jnp.minimum(one.first, other.first), jnp.maximum(one.second, other.second)
     rest = jnp.maximum(jnp.minimum(lower, seconds), jnp.minimum(one.second, other.second))
-    return Longest(
+    return Most(
         first=jnp.maximum(one.first, other.first),
         second=jnp.maximum(lower, seconds),
         third=jnp.maximum(rest, jnp.maximum(one.third, other.third)),
     )
 
 
-def nothing_met() -> Longest:
+def nothing_met() -> Most:
     """Of a segment that meets no box."""
     none = jnp.zeros((), jnp.int32)
-    return Longest(first=none, second=none, third=none)
+    return Most(first=none, second=none, third=none)
 
 
 @pytree
@@ -90,23 +97,20 @@ class Way:
     crossed: Crossed  # without a shape
     thin_m: jax.Array  # [M]
     ground: jax.Array  # [2]
-    walls_m: jax.Array  # [] length the short way in all but air
-    met: Longest
+    boxes: jax.Array  # [] matter the short way in all boxes: metres times `walls_of_materials`
+    walls: jax.Array  # [] the same with the ground
+    met: Most
 
 
-def shaped(boxes: Obstacles, a: jax.Array, b: jax.Array, way: Way, size: int | None = None) -> Crossed:
-    """``way`` [n] from ``a`` [n, 3] to ``b`` [n, 3] with its shape.
+def shaped(
+    boxes: Obstacles, of_metre: jax.Array, a: jax.Array, b: jax.Array, way: Way, size: int | None = None
+) -> Crossed:
+    """``way`` [n] from ``a`` [n, 3] to ``b`` [n, 3] with its shape; ``of_metre`` are the `walls_of_materials`.
 
     With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together.
     """
     a, b, n = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b), b.shape[0]
-    keys = jnp.concatenate([way.met.first, way.met.second])
-    # the third's, longer by what two keys may differ without being in order
-    third = jax.lax.cond(
-        jnp.any(way.met.third > 0),
-        lambda: jnp.where(way.met.third > 0, 1.02 * thin_m_of(_box(boxes, way.met.third, a, b)), 0.0),
-        lambda: jnp.zeros(n),
-    )
+    keys = jnp.concatenate([way.met.first, way.met.second, way.met.third])
 
     def of(pair: jax.Array) -> jax.Array:
         """Length the short way, share less 1, closed, and walls less 1 [DEPTHS + 3, k] of pairs [k]."""
@@ -114,8 +118,14 @@ def shaped(boxes: Obstacles, a: jax.Array, b: jax.Array, way: Way, size: int | N
         found = scattered_share(_box(boxes, keys[pair], a[row], b[row]))
         return jnp.stack([found.thin_m, *(x - 1.0 for x in found.share), found.closed, found.walls - 1.0])
 
-    each = (of(jnp.arange(2 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 2, n)
-    weight = jnp.where(keys.reshape(2, n) > 0, jnp.maximum(each[0] - third, 0.0), 0.0) / jnp.maximum(way.walls_m, 1e-9)
+    each = (of(jnp.arange(3 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 3, n)
+    matter = jnp.where(keys > 0, each[0].reshape(-1) * of_metre[_row(boxes.material, keys)], 0.0).reshape(3, n)
+    # What is left may be a box that is about to change places with the third, which then has no weight of its own but
+    # this small one, for boxes that are all alike.
+    least = jnp.min(matter, axis=0)
+    left = jnp.minimum(jnp.maximum(way.boxes - jnp.sum(matter, axis=0), 0.0), least)
+    own = matter - left * left / jnp.maximum(matter, 1e-9) + ALIKE * matter
+    weight = own * way.boxes / (jnp.maximum(jnp.sum(own, axis=0), 1e-9) * jnp.maximum(way.walls, 1e-9))
     more = [jnp.sum(jnp.where(weight > 0.0, weight * x, 0.0), axis=0) for x in each[1:]]
     share = 1.0 + jnp.stack(more[:-2], axis=-1)
     shape = Shape(thin_m=way.thin_m, share=share, closed=more[-2], walls=1.0 + more[-1], ground=way.ground)
@@ -140,18 +150,23 @@ def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size:
 
 def _box(boxes: Obstacles, key: jax.Array, a: jax.Array, b: jax.Array) -> Box:
     """The boxes of these keys [n], with segments from ``a`` [n, 3] to ``b`` [n, 3]."""
-    own = jax.tree.map(lambda x: jnp.take(x, key & ~_UPPER, axis=0, mode="clip"), boxes)
+    own = jax.tree.map(lambda x: _row(x, key), boxes)
     start, end = (in_axes(own, x - own.centre_m) for x in (a, b))
     return Box(start, end, [own.half_extent_m[:, k] for k in range(3)], own.wall_m)
 
 
-def longest(thin: jax.Array) -> Longest:
-    """Those of boxes with short ways ``thin`` [K]."""
-    key = key_of(thin, jnp.arange(thin.shape[0], dtype=jnp.int32))
+def _row(x: jax.Array, key: jax.Array) -> jax.Array:
+    """What ``x`` [K, ...] is of the boxes of these keys [n]."""
+    return jnp.take(x, key & ~_UPPER, axis=0, mode="clip")
+
+
+def most_of(matter: jax.Array) -> Most:
+    """Those of boxes with so much ``matter`` [K] the short way."""
+    key = key_of(matter, jnp.arange(matter.shape[0], dtype=jnp.int32))
     most = jnp.max(key)
     rest = jnp.where(key == most, 0, key)
     second = jnp.max(rest)
-    return Longest(first=most, second=second, third=jnp.max(jnp.where(rest == second, 0, rest)))
+    return Most(first=most, second=second, third=jnp.max(jnp.where(rest == second, 0, rest)))
 
 
 def in_axes(boxes: Obstacles, vector: jax.Array) -> list[jax.Array]:

@@ -25,7 +25,7 @@ from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import SiteSpec
 from swarmsim.pytree import on_device
 from swarmsim.site.material_guesses import Guess, guesses
-from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh
+from swarmsim.site.model import walls_among, Obstacles, Site, SiteModel, Steps, VisualMesh
 from swarmsim.site.source_files import MAX_FILE_MB, MESH_SUFFIXES, check_file, material_files
 from swarmsim.site.terrain_crossing import ceilings
 
@@ -48,18 +48,20 @@ class ImportOptions:
     guess: bool = True  # write rules for what the names of the mesh say of its materials
 
 
-def load_site(name_or_path: str | Path, material_names: Sequence[str]) -> SiteModel:
+def load_site(
+    name_or_path: str | Path, material_names: Sequence[str], densities_kg_m3: Sequence[float] | None = None
+) -> SiteModel:
     """The site of that name in ``configs/sites``, or of that folder or ``site.yaml``.
 
-    ``material_names`` is the order of the materials table, to which the obstacles' indices refer. The source file named
-    in the specification is imported, and the result is cached in the user's cache folder under a hash of the file, the
+    ``material_names`` is the order of the materials table, to which the obstacles' indices refer, and
+    ``densities_kg_m3`` their bulk densities, for ``Site.wall_kg_m3``. The source file named in the specification is imported, and the result is cached in the user's cache folder under a hash of the file, the
     specification and the importer's code; a damaged entry is rebuilt. Raises `InputError` for a site that cannot be
     loaded.
     """
     path = find("sites", name_or_path)
     spec: SiteSpec = load_named("sites", path)
     _check_materials(spec, material_names, path)
-    return _model(spec, _arrays(spec, path), material_names)
+    return _model(spec, _arrays(spec, path), material_names, densities_kg_m3)
 
 
 def _check_materials(spec: SiteSpec, known: Sequence[str], path: Path) -> None:
@@ -149,7 +151,9 @@ def _checked(arrays: Arrays) -> Arrays:
     return arrays
 
 
-def _model(spec: SiteSpec, arrays: Arrays, material_names: Sequence[str]) -> SiteModel:
+def _model(
+    spec: SiteSpec, arrays: Arrays, material_names: Sequence[str], densities_kg_m3: Sequence[float] | None = None
+) -> SiteModel:
     names = list(material_names)
     boxes = arrays["boxes"]
     material = np.array([names.index(str(m)) for m in arrays["box_materials"]], np.int32)
@@ -174,6 +178,7 @@ def _model(spec: SiteSpec, arrays: Arrays, material_names: Sequence[str]) -> Sit
         survey_area_m=on_device(arrays["survey_area"]),
         steps=_steps(arrays),
         above=ceilings(arrays["terrain"]),
+        wall_kg_m3=None if densities_kg_m3 is None else on_device(walls_among(densities_kg_m3)),
         ground_material=on_device(names.index(spec.ground_material), np.int32),
         material_names=tuple(names),
     )

@@ -39,7 +39,7 @@ NODES = 2
 """Places along each edge of a face towards the detector."""
 AWAY = 1
 """The same of the other faces."""
-PARALLEL_M = 1e-9  # over the whole segment; a smaller component of its direction is parallel to the slab
+PARALLEL_M = 1e-4  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
 _LEAST_COSINE = 1e-3
 
@@ -101,7 +101,8 @@ def matter(
     """What segments of length ``distance`` cross of boxes [K], over that length: see `Box` for the other arguments.
 
     Returns the length in matter, the integral of the place along the segment over it, and the length the shortest way
-    through each piece of matter; of a hollow box these are a wall before its inside and one after it.
+    through each piece of matter; of a hollow box these are a wall before its inside and one after it, and of a solid
+    one its halves before and after its middle. An end within matter has what is between it and the inside or middle.
     """
     middle, reach = slabs(start, along)
     inner = [half - wall_m for half in outer]
@@ -111,11 +112,26 @@ def matter(
     whole, empty = jnp.maximum(last - first, 0.0), jnp.where(hollow, jnp.maximum(leave - enter, 0.0), 0.0)
     share = whole - empty
     moment = 0.5 * (whole * (first + last) - empty * (enter + leave))
-    wall = wall_m / jnp.maximum(distance, 1e-9)
-    each = jnp.minimum(enter - first, wall) + jnp.minimum(last - leave, wall)
-    solid = 2.0 * least(outer) / jnp.maximum(distance, 1e-9)
-    shortest = jnp.where(empty > 0.0, each, jnp.where(hollow, 2.0 * wall, solid))
-    return share, moment, jnp.minimum(share, shortest)
+    thickness = jnp.maximum(jnp.where(hollow, wall_m, least(outer)), 1e-6)
+    end = [x + d for x, d in zip(start, along, strict=True)]
+    wall = jnp.where(hollow, wall_m, _mean(crossed_weights(along, outer), outer)) / jnp.maximum(distance, 1e-9)
+    before, after = (wall * _outside(x, outer, thickness) for x in (start, end))
+    each = jnp.minimum(enter - first, before) + jnp.minimum(last - leave, after)
+    return share, moment, jnp.minimum(share, jnp.where(empty > 0.0, each, before + after))
+
+
+def crossed_weights(along: list[jax.Array], half: list[jax.Array]) -> list[jax.Array]:
+    """How much a line is one through the slab of each axis of a solid box; their sum is 1.
+
+    It is that of the axis with the shortest way from face to face; the weights are the fourth powers of the inverse.
+    """
+    fourth = [jnp.square(jnp.square(d / jnp.maximum(h, 1e-3))) for d, h in zip(along, half, strict=True)]
+    total = jnp.maximum(fourth[0] + fourth[1] + fourth[2], 1e-12)
+    return [x / total for x in fourth]
+
+
+def _mean(weights: list[jax.Array], x: list[jax.Array]) -> jax.Array:
+    return weights[0] * x[0] + weights[1] * x[1] + weights[2] * x[2]
 
 
 def slabs(start: list[jax.Array], along: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -140,13 +156,6 @@ def most(x: list[jax.Array]) -> jax.Array:
 def least(x: list[jax.Array]) -> jax.Array:
     """Smallest of three."""
     return jnp.minimum(jnp.minimum(x[0], x[1]), x[2])
-
-
-def thin_m_of(box: Box) -> jax.Array:
-    """Length [n] the shortest way through the matter that lines meet."""
-    along = [b - a for a, b in zip(box.start, box.end, strict=True)]
-    distance = jnp.sqrt(sum(jnp.square(x) for x in along))
-    return distance * matter(box.start, along, box.half, box.wall_m, distance)[2]
 
 
 def scattered_share(box: Box, k: Constants | None = None) -> Shares:
@@ -208,20 +217,20 @@ class _Faces(NamedTuple):
 
 
 def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Faces]:
-    """Of each axis the face towards the detector, and the other one."""
-    inverse = [1.0 / jnp.maximum(jnp.square(h * h), 1e-12) for h in box.half]
-    total = inverse[0] + inverse[1] + inverse[2]
+    """Of each axis the face towards the end that is farther out, and the other one."""
+    along = [jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True)]
+    squared, found = along[0] + along[1] + along[2], []
+    # the middle plane of a solid box is one, and the line crosses it within the box where the others are far off
+    crossed = crossed_weights([b - a for a, b in zip(box.start, box.end, strict=True)], box.half)
     edge = jnp.where(hollow, 0.5 * box.wall_m, 0.0)
-    x, y, z = (jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True))
-    squared, found = x + y + z, []
     for sign in (1.0, -1.0):
         rows = []
         for axis in range(3):
             plane = jnp.where(hollow, box.half[axis] - edge, 0.0)
             s, d = box.start[axis], box.end[axis]
-            side = jnp.where(d > s, sign, -sign)
-            # the middle plane of a solid box is one
-            weight = jnp.where(hollow, 1.0 / walls, inverse[axis] / total * (0.5 + 0.5 * sign))
+            # of the end that is farther out: the line passes through this face, if through one of the two
+            side = sign * jnp.where(jnp.where(jnp.abs(d) >= jnp.abs(s), d, s) > 0.0, 1.0, -1.0)
+            weight = jnp.where(hollow, 1.0 / walls, crossed[axis] * (0.5 + 0.5 * sign))
             spans = [x for j in range(3) if j != axis for x in (
                 edge - box.half[j] - box.start[j], box.half[j] - edge - box.start[j], box.end[j] - box.start[j]
             )]  # fmt: skip

@@ -19,6 +19,7 @@ import numpy as np
 
 from swarmsim.pytree import on_device, pytree, static
 
+LEAST_STEP = 2.0**-23  # more than float32 can leave out of a sum below 1
 NUDGE_CELLS = 1e-3  # a step ends on the border of a tile; so far ahead is asked which tile comes next
 ROUNDING_M = 1e-3  # so far above the ground a part of a segment counts as clear: its ends are rounded
 
@@ -128,7 +129,7 @@ def below(site: Any, above: Ceilings, a: jax.Array, b: jax.Array) -> Below:
     way = (b[:2] - a[:2]) / site.cell_m
     rise, top = b[2] - a[2], len(above.shapes) - 1
     # in units of the segment's length
-    ahead = jnp.minimum(NUDGE_CELLS / jnp.maximum(jnp.max(jnp.abs(way)), 1e-9), 1.0)
+    ahead = jnp.clip(NUDGE_CELLS / jnp.maximum(jnp.max(jnp.abs(way)), 1e-9), LEAST_STEP, 1.0)
     raster = site.terrain_m.reshape(-1)
     ny, nx = site.terrain_m.shape
     patch = partial(_patch, raster, (ny, nx), start, way, site.cell_m)

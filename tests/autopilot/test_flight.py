@@ -20,7 +20,7 @@ SURVEY = (
 )
 QUICK = Autopilot(
     take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=10.0, land_s=20.0,
-    watchdogs=Watchdogs(heartbeat_s=3.0, position_s=2.0, stale_s=3.0, hold_s=0.1),  # a loaded machine pauses
+    watchdogs=Watchdogs(heartbeat_s=5.0, position_s=4.0, stale_s=5.0, hold_s=0.1),  # a loaded machine pauses
 )  # fmt: skip
 LATE = (
     "{name: first, who: [uav2], policy: waypoints, "
@@ -63,7 +63,7 @@ def reached(flight, link, stage="mission", seconds=1.0):
     """Wait until the flight has been in a stage for a while."""
     deadline = time.monotonic() + 30.0
     while stage not in [what for _, what in flight.log.events]:
-        assert time.monotonic() < deadline
+        assert time.monotonic() < deadline, (flight.log.ended, flight.log.events)
         time.sleep(0.01)
     time.sleep(seconds)
 

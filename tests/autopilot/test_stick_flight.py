@@ -21,7 +21,7 @@ SURVEY = (
 )
 SETTINGS = Autopilot(
     take_off_m=1.5, answer_s=5.0, ready_s=10.0, take_off_s=20.0, land_s=40.0,
-    watchdogs=Watchdogs(heartbeat_s=2.0, position_s=1.5, stale_s=1.0, hold_s=0.1),
+    watchdogs=Watchdogs(heartbeat_s=4.0, position_s=3.0, stale_s=3.0, hold_s=0.1),  # a loaded machine pauses
 )  # fmt: skip
 OUTLINE = np.array([[-100.0, -100.0], [100.0, -100.0], [100.0, 100.0], [-100.0, 100.0]])
 

@@ -161,6 +161,19 @@ def test_gradient_exists_on_the_axis_and_at_the_crystal(detectors: Detectors) ->
         assert np.all(np.isfinite(np.asarray(jax.grad(rate)(jnp.array(place)))))
 
 
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.6, 0.0, 0.8)])
+def test_the_rate_is_steady_to_the_centre_of_the_crystal(
+    detectors: Detectors, direction: tuple[float, float, float]
+) -> None:
+    """A source there has no direction, and counts as one beside it does."""
+    d = detectors["nai_2x2", "physical"]
+    distance = jnp.concatenate([jnp.zeros(1), jnp.geomspace(1e-8, 1e-3, 40)])
+    axis, way = jnp.array([0.0, 0.0, 1.0]), through(d, air=0.0)
+    rate = jax.jit(jax.vmap(lambda place: net_rate(d, point(d, "Cs-137"), way, place, axis)))
+    found = np.asarray(rate(distance[:, None] * jnp.array(direction)))
+    assert found.max() / found.min() < 1.6
+
+
 def test_restrict_keeps_the_rate(detectors: Detectors) -> None:
     detector = detectors["nai_1p5x1p5", "physical"]
     alone = restrict(detector, ("Co-60",))

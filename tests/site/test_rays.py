@@ -153,6 +153,14 @@ def test_gradient_is_finite(b):
         assert np.isfinite(gradient).all()
 
 
+@pytest.mark.parametrize(("a", "b"), [((0, 0, -2), (5, 0, -2)), ((-5, 0, 2), (5, 0, 2)), ((-5, 2, 2), (5, 2, 2))])
+def test_gradients_in_the_plane_of_a_face_can_be_used(a, b):
+    """Where the length has none: a change of 0.1 mm decides whether the box is crossed."""
+    site = make_site([((0, 0, 0), (2, 2, 2), 0.0, 0.0, "brick")])
+    for gradient in gradients(site, jnp.array(a, jnp.float32), jnp.array(b, jnp.float32)):
+        assert np.max(np.abs(gradient)) < 1e5
+
+
 def test_gradient_equals_difference():
     site = make_site([((0, 0, 0), (3, 2, 4), 0.3, 0.0, "brick")])
     a, b = jnp.array([-10.0, 1.0, 1.0]), jnp.array([12.0, 0.5, 2.0])

@@ -147,3 +147,13 @@ def test_vertical_and_empty_segments():
     assert float(down[SOIL]) == pytest.approx(3.0, rel=1e-4)
     place = jnp.array([3.3, 4.4, ground - 1.0])
     assert not np.isnan(np.asarray(path_lengths(site, place, place))).any()
+
+
+def test_a_raster_of_many_cells_is_crossed_to_its_end():
+    """A step over the border of a tile is less than float32 adds to a place near 1 of so long a segment."""
+    terrain = np.zeros((2, 120_001))
+    terrain[:, 100_000:] = 3.0
+    site = make_site((), terrain=terrain, cell=0.01, origin=(0.0, 0.0))
+    share, place = _shares(site, jnp.array([[0.0, 0.005, 1.0]]), jnp.array([[1200.0, 0.005, 1.0]]))
+    assert float(share[0]) == pytest.approx(200.0 / 1200.0, abs=1e-4)
+    assert float(place[0]) == pytest.approx(1100.0 / 1200.0, abs=1e-3)
