@@ -62,10 +62,10 @@ def test_counts_of_drawn_cases_are_those_of_the_monte_carlo(
 @pytest.mark.parametrize(
     ("kind", "within_10", "within_25"),
     [("inside", 0.8, 0.95), ("container", 0.9, 1.0), ("cube", 0.7, 0.95), ("wall", 0.8, 0.9), ("square", 1.0, 1.0),
-     ("behind", 0.4, 0.65)],
+     ("behind", 0.4, 0.65), ("block", 0.8, 0.85)],
 )  # fmt: skip
 def test_counts_of_cases_known_to_2_percent(detector: Detector, kind: str, within_10: float, within_25: float) -> None:
-    """In buildings, containers and cubes, behind walls and buildings, and wide walls that are crossed squarely."""
+    """In buildings, containers and cubes, behind walls, buildings and blocks; wide walls that are crossed squarely."""
     text = [line for line in SHELLS.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     ratio = []
     for row in csv.DictReader(text):
