@@ -25,7 +25,7 @@ from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import SiteSpec
 from swarmsim.pytree import on_device
 from swarmsim.site.material_guesses import Guess, guesses
-from swarmsim.site.model import walls_among, Obstacles, Site, SiteModel, Steps, VisualMesh
+from swarmsim.site.model import Obstacles, Site, SiteModel, Steps, VisualMesh, walls_among
 from swarmsim.site.source_files import MAX_FILE_MB, MESH_SUFFIXES, check_file, material_files
 from swarmsim.site.terrain_crossing import ceilings
 
@@ -54,9 +54,9 @@ def load_site(
     """The site of that name in ``configs/sites``, or of that folder or ``site.yaml``.
 
     ``material_names`` is the order of the materials table, to which the obstacles' indices refer, and
-    ``densities_kg_m3`` their bulk densities, for ``Site.wall_kg_m3``. The source file named in the specification is imported, and the result is cached in the user's cache folder under a hash of the file, the
-    specification and the importer's code; a damaged entry is rebuilt. Raises `InputError` for a site that cannot be
-    loaded.
+    ``densities_kg_m3`` their bulk densities, for ``Site.wall_kg_m3``. The source file named in the specification is
+    imported, and the result is cached in the user's cache folder under a hash of the file, the specification and the
+    importer's code; a damaged entry is rebuilt. Raises `InputError` for a site that cannot be loaded.
     """
     path = find("sites", name_or_path)
     spec: SiteSpec = load_named("sites", path)

@@ -1,7 +1,8 @@
 """Photons that one box scatters into a detector, over those of an infinitely wide wall that the line crosses squarely.
 
 Each face of a hollow box is one surface, which source and detector look at from the same side or from both; a solid box
-is its middle plane, of each axis as far as the box is thin along it. A place of the surface scatters
+is its middle plane, of each axis as far as the line leads through that one (`crossed_weights`). A place of the surface
+scatters
 
     K dA / (d^2 d'^2),  K = F / (1 + r (1 - cos))^2 + m
 

@@ -73,7 +73,7 @@ def test_a_sheet_of_steel_counts_before_a_thicker_board(detector: Detector) -> N
 
 @pytest.mark.parametrize("wall", [0.05, 0.2])
 def test_a_detector_in_a_house_counts_as_one_outside_does_from_within(detector: Detector, wall: float) -> None:
-    """Photons go both ways alike, but for their energy: a source outside, a detector inside, and the other way round."""
+    """Photons go both ways alike, but for their energy: a source outside and a detector inside, or the reverse."""
     site = yard(detector, ((0.0, 0.0, 0.0), HOUSE, wall, "concrete"))
     inside = [(0.0, 3.4, 0.0), (3.0, -2.0, 0.5), (-4.0, 1.0, -1.0), (0.0, 0.0, 0.0)]
     outside = [(0.0, 40.0, 0.0), (30.0, 5.0, 8.0), (-9.0, 20.0, 3.0), (3.0, -9.0, 1.0)]
