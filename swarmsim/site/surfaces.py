@@ -38,6 +38,8 @@ DEPTHS = (0.25, 0.75, 2.25, 6.75)
 """Depths of a wall in mean free paths, each three times the one before."""
 NODES = 2
 """Places along each edge of a face towards the detector."""
+MOVING = 0.25
+"""How near to a face a detector moves the places of the one opposite, over the box's half extent."""
 AWAY = 1
 """The same of the other faces."""
 PARALLEL_M = 1e-4  # over the whole segment; a smaller component of its direction is parallel to the slab
@@ -214,11 +216,12 @@ class _Faces(NamedTuple):
     foot: tuple[jax.Array, jax.Array]  # the detector's foot
     squared: jax.Array  # [n] distance of source and detector, squared
     weight: jax.Array
+    apart: jax.Array  # 0..1 how far the places of the face lie from their middle
     opposite: jax.Array  # whether source and detector are on different sides
 
 
 def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Faces]:
-    """Of each axis the face towards the end that is farther out, and the other one."""
+    """Of each axis the face that lies between source and detector, of two that of the detector, and the other one."""
     along = [jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True)]
     squared, found = along[0] + along[1] + along[2], []
     # the middle plane of a solid box is one, and the line crosses it within the box where the others are far off
@@ -229,18 +232,22 @@ def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Face
         for axis in range(3):
             plane = jnp.where(hollow, box.half[axis] - edge, 0.0)
             s, d = box.start[axis], box.end[axis]
-            # of the end that is farther out: the line passes through this face, if through one of the two
-            side = sign * jnp.where(jnp.where(jnp.abs(d) >= jnp.abs(s), d, s) > 0.0, 1.0, -1.0)
+            # the face between the ends, if there is one, and of two that the detector is nearer to
+            within = jnp.abs(d) < plane
+            side = jnp.where(jnp.where(within, s, d - s) > 0.0, sign, -sign)
+            # where the detector passes from the one case to the other, places of the face move together
+            near = jnp.abs(jnp.abs(d) - plane) / jnp.maximum(MOVING * box.half[axis], _LEAST_M)
+            apart = jnp.where(hollow & (d * s < 0.0), jnp.clip(near, 0.0, 1.0), 1.0)
             weight = jnp.where(hollow, 1.0 / walls, crossed[axis] * (0.5 + 0.5 * sign))
             spans = [x for j in range(3) if j != axis for x in (
                 edge - box.half[j] - box.start[j], box.half[j] - edge - box.start[j], box.end[j] - box.start[j]
             )]  # fmt: skip
-            rows.append((side * s - plane, side * d - plane, weight, *spans))
+            rows.append((side * s - plane, side * d - plane, weight, apart, *spans))
         rows = jax.lax.optimization_barrier(rows)
-        source, detector, weight, l1, h1, f1, l2, h2, f2 = (jnp.stack(x) for x in zip(*rows, strict=True))
+        source, detector, weight, apart, l1, h1, f1, l2, h2, f2 = (jnp.stack(x) for x in zip(*rows, strict=True))
         found.append(_Faces(
             source=source, detector=detector, low=(l1, l2), high=(h1, h2), foot=(f1, f2), squared=squared,
-            weight=weight, opposite=source * detector < 0.0,
+            weight=weight, apart=apart, opposite=source * detector < 0.0,
         ))  # fmt: skip
     return found[0], found[1]
 
@@ -255,7 +262,7 @@ def _seen(faces: _Faces, nodes_of_edge: int, k: Constants) -> list[jax.Array]:
     h = k.width * jnp.sqrt(near * far) / (jnp.sqrt(near) + jnp.sqrt(far))
     part = near / (near + far)
     # a face that is seen from one side has one place, whichever way the line runs
-    apart = jnp.where(faces.opposite, 1.0, 0.0)
+    apart = jnp.where(faces.opposite, faces.apart, 0.0)
     along, across = (
         _along(low, high, foot * part, h, nodes_of_edge, apart) for low, high, foot in zip(*faces[2:5], strict=True)
     )

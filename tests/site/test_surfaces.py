@@ -50,7 +50,9 @@ def test_the_axes_of_a_box_are_alike():
         ((1.0, 0.5, 0.0), (30.0, 6.0, 1.0)),  # from beyond one wall,
         ((1.0, 0.5, 0.0), (-30.0, 3.0, 9.0)),
         ((-4.0, 3.5, -1.5), (6.0, 8.0, 6.0)),
-        ((-20.0, 1.0, 0.5), (12.0, 3.0, -0.5)),  # through the whole house
+        ((-20.0, 1.0, 0.5), (12.0, 3.0, -0.5)),  # through the whole house,
+        ((-20.0, 6.0, 3.5), (24.0, 8.0, -3.0)),  # from farther out than the source as well
+        ((-20.0, 6.0, 3.5), (2.0, -3.0, 1.0)),  # and into it
     ],
 )
 def test_shares_are_continuous_around_a_house(first, last):
