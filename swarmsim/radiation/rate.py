@@ -18,6 +18,10 @@ from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.walls import Scattered, scattered_counts
 from swarmsim.site.rays import Crossed
 
+INDOORS = 0.1
+HELD_BACK = 3.0
+"""Depth of walls for the photons that the ground scatters, over that for those of the source."""
+
 
 def line_rates(
     detector: Detector, source: Source, way: Crossed, position_m: jax.Array, axis: jax.Array
@@ -44,12 +48,26 @@ def _parts(
 def from_ground(detector: Detector, nuclide: jax.Array, way: Crossed) -> jax.Array:
     """Counts [..., L] of photons that the ground scatters over those of the photons from the source.
 
-    Walls hold back the former as the latter.
+    Walls hold back the former as the latter. A building does so more the thicker its walls are, for the former are
+    softer, and diffuses them: of what the ground below a source in it scatters, as much comes to every place around as
+    in the open to one that looks on it at an elevation with the sine `INDOORS`. So it is in the Monte Carlo of
+    buildings (``experiments/transport/enclosures.py``), where the open air's would be up to 1.8 times too much.
     """
     if way.shape is None or detector.kind == "paper_ideal":
         return jnp.zeros((*way.length_m.shape[:-1], detector.yields.shape[1]))
-    share = way.shape.ground[..., None, :] * detector.ground[nuclide]
-    return share[..., 0] + share[..., 1]
+    return _from_ground(detector, nuclide, way)[0]
+
+
+def _from_ground(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[jax.Array, jax.Array]:
+    """`from_ground` of a way with a shape, and its derivative [..., L] by the depth of walls."""
+    assert way.shape is not None
+    a, b = detector.ground[nuclide, :, 0], detector.ground[nuclide, :, 1]
+    walls_m = way.shape.thin_m * (1.0 - detector.surrounds)
+    kept = jnp.exp(-HELD_BACK * jnp.einsum("...m,lm->...l", walls_m, detector.attenuation_1_m[nuclide]))
+    outdoors = way.shape.ground[..., None, 0] * a + way.shape.ground[..., None, 1] * b
+    indoors = way.shape.low[..., None] * (a * INDOORS**0.5 + b * INDOORS)
+    change = way.shape.closed[..., None] * (indoors - outdoors)
+    return outdoors + (1.0 - kept) * change, HELD_BACK * kept * change
 
 
 def transmission(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[jax.Array, jax.Array]:
@@ -205,14 +223,20 @@ def roi_rates_and_slopes(
     part = jnp.where(depth[..., None] > 1e-6, layers / jnp.maximum(depth, 1e-6)[..., None], 1.0 / layers.shape[-1])
     mixed = jnp.stack([(1.0 - deep)[..., None] * part, deep[..., None] * part], axis=2)  # [n, L, depths, M]
     shares = jnp.einsum("nldm,dmlr->nlr", mixed, detector.scattered_rois[nuclide])
-    ground = from_ground(detector, nuclide, way)[..., None] * detector.ground_rois[nuclide]
+    nothing = jnp.zeros_like(depth)
+    by_ground, rise = (nothing, nothing) if way.shape is None else _from_ground(detector, nuclide, way)
+    ground = by_ground[..., None] * detector.ground_rois[nuclide]
     shares, peaks = shares + ground, peaks + ground  # [n, L, R]
     rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
     slants = found.slant_layers[..., chosen]  # [n, L, U]
     changes = layers[..., chosen] * found.by_depth[..., None]
     changes -= detector.surrounds[chosen] * layers[..., chosen] * found.by_walls[..., None]
     of_scattered = (seen[..., None] * changes)[..., None] * shares[:, :, None]
-    return rates, jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[:, :, None], axis=1)
+    slopes = jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[..., None, :], axis=1)
+    rising = (
+        (rise * (direct + seen * found.counts))[..., None] * layers[..., chosen] * (1.0 - detector.surrounds[chosen])
+    )
+    return rates, slopes + jnp.einsum("nlu,lr->nur", rising, detector.ground_rois[nuclide])
 
 
 def observed_rois(detector: Detector, net_cps: jax.Array, background: jax.Array | float = 1.0) -> jax.Array:

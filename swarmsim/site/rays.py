@@ -33,6 +33,7 @@ from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 NEIGHBOURS = 16  # segments that are intersected with the same clusters of boxes
 PAIRS = 128  # of a segment and a box, of which shares are computed at a time
 CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
+LOW_M = 2.0  # height at which half of the ground is left of what a low source in a building sees of it
 _TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
 
 
@@ -86,8 +87,10 @@ def _way(site: Site, above: Ceilings, a: jax.Array, b: jax.Array, boxes: "Boxes 
         fractions, thin = fractions + rest, thin + rest
     place = jax.lax.stop_gradient(jnp.clip(place, 0.0, 1.0))
     crossed = Crossed(length_m=distance * fractions, place=place)
-    thin_m, ground = distance * thin, mirrored(site, a, b)
-    return Way(crossed=crossed, thin_m=thin_m, ground=ground, boxes=in_boxes, walls=in_all, met=found.met)
+    heights = above_ground(site, a, b)
+    thin_m, ground = distance * thin, mirrored(a, b, *heights)
+    low = 1.0 / (1.0 + jnp.square(jax.lax.stop_gradient(jnp.minimum(*heights)) / LOW_M))
+    return Way(crossed=crossed, thin_m=thin_m, ground=ground, low=low, boxes=in_boxes, walls=in_all, met=found.met)
 
 
 def _length(vector: jax.Array) -> jax.Array:
@@ -96,13 +99,18 @@ def _length(vector: jax.Array) -> jax.Array:
     return jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), 0.0)
 
 
-def mirrored(site: Site, a: jax.Array, b: jax.Array) -> jax.Array:
+def above_ground(site: Site, a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Heights [] of the ends of a segment above the ground below each; 0 below it."""
+    one, other = (jnp.maximum(x[2] - sample(site.terrain_m, site, x[:2]), 0.0) for x in (a, b))
+    return one, other
+
+
+def mirrored(a: jax.Array, b: jax.Array, one: jax.Array, other: jax.Array) -> jax.Array:
     """(r / r')^2 (sqrt(u), u) [2] of a segment above the ground: `swarmsim.radiation.ground`.
 
     r is the distance of its ends, r' that of the one from the other's mirror image below the ground, u the sine of the
-    image's elevation; by the ends' heights above the ground below each.
+    image's elevation; by the ends' heights ``one`` and ``other`` [] above the ground below each.
     """
-    one, other = (jnp.maximum(x[2] - sample(site.terrain_m, site, x[:2]), 0.0) for x in (a, b))
     level2 = jnp.square(b[0] - a[0]) + jnp.square(b[1] - a[1])
     both, image2 = one + other, level2 + jnp.square(one + other) + 1e-12
     u, ratio = both * jax.lax.rsqrt(image2), (level2 + jnp.square(one - other)) / image2

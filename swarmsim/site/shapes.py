@@ -28,6 +28,7 @@ class Shape:
     closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box
     walls: jax.Array  # [...] 1..2: walls of a box that are crossed in turn
     ground: jax.Array  # [..., 2] how the ground shines, see `mirrored`
+    low: jax.Array  # [...] 0..1: how near to the ground the lower end of the segment is
 
 
 @pytree
@@ -48,8 +49,9 @@ def stretched(way: Crossed, factors: jax.Array) -> Crossed:
 def wide(thin_m: jax.Array, ground: jax.Array) -> Shape:
     """That of infinite walls crossed squarely: ``thin_m`` [..., M], ``ground`` [..., 2]."""
     one = jnp.ones(thin_m.shape[:-1])
+    nothing = jnp.zeros_like(one)
     return Shape(
-        thin_m=thin_m, share=jnp.ones((*one.shape, len(DEPTHS))), closed=jnp.zeros_like(one), walls=one, ground=ground
+        thin_m=thin_m, share=jnp.ones((*one.shape, len(DEPTHS))), closed=nothing, walls=one, ground=ground, low=nothing
     )
 
 
@@ -97,6 +99,7 @@ class Way:
     crossed: Crossed  # without a shape
     thin_m: jax.Array  # [M]
     ground: jax.Array  # [2]
+    low: jax.Array  # []
     boxes: jax.Array  # [] matter the short way in all boxes: metres times `walls_of_materials`
     walls: jax.Array  # [] the same with the ground
     met: Most
@@ -128,7 +131,7 @@ def shaped(
     weight = own * way.boxes / (jnp.maximum(jnp.sum(own, axis=0), 1e-9) * jnp.maximum(way.walls, 1e-9))
     more = [jnp.sum(jnp.where(weight > 0.0, weight * x, 0.0), axis=0) for x in each[1:]]
     share = 1.0 + jnp.stack(more[:-2], axis=-1)
-    shape = Shape(thin_m=way.thin_m, share=share, closed=more[-2], walls=1.0 + more[-1], ground=way.ground)
+    shape = Shape(thin_m=way.thin_m, share=share, closed=more[-2], walls=1.0 + more[-1], ground=way.ground, low=way.low)
     return replace(way.crossed, shape=shape)
 
 

@@ -37,7 +37,7 @@ def ways(detector: Detector, seed: int, count: int, walls: float = 0.3) -> tuple
         thin_m=f32(length * np.where(rng.random(length.shape) < 0.5, 1.0, rng.uniform(0.3, 1.0, length.shape))),
         share=f32(rng.uniform(0.1, 1.0, count)[:, None] * other.uniform(0.7, 1.4, (count, len(DEPTHS)))),
         closed=f32(rng.integers(2, size=count)), walls=f32(other.uniform(1.0, 2.0, count)),
-        ground=f32(np.sort(rng.uniform(0.0, 1.0, (count, 2)))[:, ::-1]),
+        ground=f32(np.sort(rng.uniform(0.0, 1.0, (count, 2)))[:, ::-1]), low=f32(other.uniform(0.0, 1.0, count)),
     )  # fmt: skip
     return Crossed(length_m=f32(length), place=f32(between), shape=shape), f32(place), f32(axis)
 

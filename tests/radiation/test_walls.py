@@ -27,7 +27,7 @@ def shaped(
     f32 = jnp.float32
     shape = Shape(
         thin_m=way.length_m * thin, share=jnp.full(len(DEPTHS), share, f32), closed=f32(closed), walls=f32(walls),
-        ground=jnp.full(2, ground, f32),
+        ground=jnp.full(2, ground, f32), low=f32(ground > 0.0),
     )  # fmt: skip
     return replace(way, shape=shape)
 
