@@ -1,5 +1,6 @@
 """What an answer is worth: a status and a sentence, from every diagnostic that the mission computed."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -162,14 +163,14 @@ def in_mbq(activity_mbq: float) -> str:
 def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
     """Faint sources beside a strong one of the same nuclide, or any two at one place: errors of the model of walls."""
     found: list[tuple[Status, str]] = []
-    for k, faint in enumerate(final):
-        for strong in [*final[:k], *final[k + 1 :]]:
-            apart = float(np.linalg.norm(np.asarray(faint.position_m)[:2] - np.asarray(strong.position_m)[:2]))
-            share = faint.activity_mbq / max(strong.activity_mbq, 1e-12)
-            near = apart < COMPANION_M if share < COMPANION_SHARE else share <= 1.0 and apart < ONE_M
-            if faint.nuclide == strong.nuclide and near:
-                text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside a stronger one"
-                found.append(("ambiguous", f"{text} may be an error of the model"))
+    for pair in itertools.combinations(final, 2):
+        faint, strong = sorted(pair, key=lambda one: one.activity_mbq)
+        apart = float(np.linalg.norm(np.asarray(faint.position_m)[:2] - np.asarray(strong.position_m)[:2]))
+        share = faint.activity_mbq / max(strong.activity_mbq, 1e-12)
+        if faint.nuclide == strong.nuclide and apart < (COMPANION_M if share < COMPANION_SHARE else ONE_M):
+            other = "a stronger one" if share < 1.0 else "another one"
+            text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
+            found.append(("ambiguous", f"{text} may be an error of the model"))
     return found
 
 
