@@ -8,8 +8,8 @@ are within a few per cent of the total
 
     (r / r')^2 (a sqrt(u) + b u)
 
-with a and b for each line and detector. As (r / r')^2 and u, the ratio is symmetric in source and detector. In a building
-it is another (`swarmsim.radiation.rate.from_ground`).
+with a and b for each line and detector. As (r / r')^2 and u, the ratio is symmetric in source and detector. In a
+building it is another (`swarmsim.radiation.rate.from_ground`).
 """
 
 from collections.abc import Callable
