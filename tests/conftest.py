@@ -12,8 +12,6 @@ from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that the spreading of batches is tested
-# Small programs run at once where they are called: handed to another thread, each waits for its turn on a busy core.
-os.environ.setdefault("JAX_CPU_ENABLE_ASYNC_DISPATCH", "false")
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see swarmsim/__init__.py
 # Two workers share two cores: threads of NumPy's that wait for work by spinning tripled the time of building a mission.

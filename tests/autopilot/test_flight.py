@@ -20,7 +20,7 @@ SURVEY = (
 )
 QUICK = Autopilot(
     take_off_m=2.0, answer_s=1.0, ready_s=1.0, take_off_s=10.0, land_s=20.0,
-    watchdogs=Watchdogs(heartbeat_s=5.0, position_s=4.0, stale_s=5.0, hold_s=0.1),  # a loaded machine pauses
+    watchdogs=Watchdogs(heartbeat_s=5.0, position_s=4.0, stale_s=20.0, hold_s=0.1),  # a loaded machine pauses
 )  # fmt: skip
 LATE = (
     "{name: first, who: [uav2], policy: waypoints, "

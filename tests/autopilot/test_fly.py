@@ -41,7 +41,7 @@ phases:
     settings: {points: [[-70, -42], [-60, -42]], speed_m_s: 2.3, altitude_m: 6.0}
     time_limit_s: 60
   - {name: drive, who: rover, policy: waypoints, settings: {points: [[-64, -50]], speed_m_s: 0.9}, time_limit_s: 40}
-autopilot: {take_off_m: 2.0, ready_s: 20, land_s: 15, watchdogs: {heartbeat_s: 2.5}}
+autopilot: {take_off_m: 2.0, ready_s: 20, land_s: 15, watchdogs: {heartbeat_s: 2.5, stale_s: 10}}
 """
 
 
