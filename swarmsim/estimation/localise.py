@@ -139,7 +139,7 @@ def presume(
     known = replace(
         known,
         material_names=names,
-        wall_kg_m3=None if known.wall_kg_m3 is None else known.wall_kg_m3[np.array(used)],
+        wall_kg_m3=None if known.wall_kg_m3 is None else on_host(np.asarray(known.wall_kg_m3)[used]),
         ground_material=new[int(known.ground_material)],
         obstacles=replace(known.obstacles, material=new[np.asarray(known.obstacles.material)]),
     )

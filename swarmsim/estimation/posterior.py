@@ -22,9 +22,10 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.device import each, either
-from swarmsim.estimation.fit import MEAN_FLOOR, Others, Unknowns, alone, normal_equations, settle
+from swarmsim.estimation.fit import alone, settle
 from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
+from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, normal_equations
 from swarmsim.estimation.search import TOGETHER, attempt, bounds, screen_of, screened, spread
 from swarmsim.estimation.sources import ALONE_STEPS, State, as_known, without
 from swarmsim.pytree import pytree

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.estimation.fit import Others, Unknowns, linearised, normal_equations
 from swarmsim.estimation.forward import Problem, detector_of, padded, silent
+from swarmsim.estimation.normal_equations import Others, Unknowns, linearised, normal_equations
 from swarmsim.pytree import on_device, pytree
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.ground import basis

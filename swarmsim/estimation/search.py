@@ -12,17 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.device import each
-from swarmsim.estimation.fit import (
-    MEAN_FLOOR,
-    Others,
-    Settled,
-    Unknowns,
-    linearised,
-    normal_equations,
-    settle,
-)
+from swarmsim.estimation.fit import Settled, settle
 from swarmsim.estimation.forward import Problem, Rates, rates, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
+from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations
 from swarmsim.pytree import pytree
 from swarmsim.site.model import bounds_m
 

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.device import either, switch
-from swarmsim.estimation.fit import FLAT, Others, Settled, Unknowns, nothing_known, without_more
+from swarmsim.estimation.fit import FLAT, Settled, without_more
 from swarmsim.estimation.forward import Problem, Rates, rates, variance_of, ways_from
 from swarmsim.estimation.likelihood import position_of
+from swarmsim.estimation.normal_equations import Others, Unknowns, nothing_known
 from swarmsim.estimation.scan import scan, strongest
 from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
 from swarmsim.pytree import pytree, static

@@ -19,6 +19,7 @@ from swarmsim.radiation.walls import Scattered, scattered_counts
 from swarmsim.site.rays import Crossed
 
 INDOORS = 0.1
+"""Sine of the elevation at which, in the open, as much comes from the ground as out of a building with thick walls."""
 HELD_BACK = 3.0
 """Depth of walls for the photons that the ground scatters, over that for those of the source."""
 
@@ -55,15 +56,20 @@ def from_ground(detector: Detector, nuclide: jax.Array, way: Crossed) -> jax.Arr
     """
     if way.shape is None or detector.kind == "paper_ideal":
         return jnp.zeros((*way.length_m.shape[:-1], detector.yields.shape[1]))
-    return _from_ground(detector, nuclide, way)[0]
+    layers = way.shape.thin_m[..., None, :] * detector.attenuation_1_m[nuclide]
+    return _from_ground(detector, nuclide, way, layers)[0]
 
 
-def _from_ground(detector: Detector, nuclide: jax.Array, way: Crossed) -> tuple[jax.Array, jax.Array]:
-    """`from_ground` of a way with a shape, and its derivative [..., L] by the depth of walls."""
+def _from_ground(
+    detector: Detector, nuclide: jax.Array, way: Crossed, layers: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """`from_ground` of a way with a shape, and its derivative [..., L] by the depth of walls.
+
+    ``layers`` [..., L, M] are the optical depths of the materials the short way.
+    """
     assert way.shape is not None
     a, b = detector.ground[nuclide, :, 0], detector.ground[nuclide, :, 1]
-    walls_m = way.shape.thin_m * (1.0 - detector.surrounds)
-    kept = jnp.exp(-HELD_BACK * jnp.einsum("...m,lm->...l", walls_m, detector.attenuation_1_m[nuclide]))
+    kept = jnp.exp(-HELD_BACK * jnp.sum(layers * (1.0 - detector.surrounds), axis=-1))
     outdoors = way.shape.ground[..., None, 0] * a + way.shape.ground[..., None, 1] * b
     indoors = way.shape.low[..., None] * (a * INDOORS**0.5 + b * INDOORS)
     change = way.shape.closed[..., None] * (indoors - outdoors)
@@ -224,7 +230,7 @@ def roi_rates_and_slopes(
     mixed = jnp.stack([(1.0 - deep)[..., None] * part, deep[..., None] * part], axis=2)  # [n, L, depths, M]
     shares = jnp.einsum("nldm,dmlr->nlr", mixed, detector.scattered_rois[nuclide])
     nothing = jnp.zeros_like(depth)
-    by_ground, rise = (nothing, nothing) if way.shape is None else _from_ground(detector, nuclide, way)
+    by_ground, rise = (nothing, nothing) if way.shape is None else _from_ground(detector, nuclide, way, layers)
     ground = by_ground[..., None] * detector.ground_rois[nuclide]
     shares, peaks = shares + ground, peaks + ground  # [n, L, R]
     rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)

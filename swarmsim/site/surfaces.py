@@ -38,10 +38,10 @@ DEPTHS = (0.25, 0.75, 2.25, 6.75)
 """Depths of a wall in mean free paths, each three times the one before."""
 NODES = 2
 """Places along each edge of a face towards the detector."""
-MOVING = 0.25
-"""How near to a face a detector moves the places of the one opposite, over the box's half extent."""
 AWAY = 1
 """The same of the other faces."""
+MOVING = 0.25
+"""How near to a face a detector moves the places of the one opposite, over the box's half extent."""
 PARALLEL_M = 1e-4  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
 _LEAST_COSINE = 1e-3
@@ -222,10 +222,11 @@ class _Faces(NamedTuple):
 
 def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Faces]:
     """Of each axis the face that lies between source and detector, of two that of the detector, and the other one."""
-    along = [jnp.square(b - a) for a, b in zip(box.start, box.end, strict=True)]
-    squared, found = along[0] + along[1] + along[2], []
+    along = [b - a for a, b in zip(box.start, box.end, strict=True)]
+    x, y, z = (jnp.square(component) for component in along)
+    squared, found = x + y + z, []
     # the middle plane of a solid box is one, and the line crosses it within the box where the others are far off
-    crossed = crossed_weights([b - a for a, b in zip(box.start, box.end, strict=True)], box.half)
+    crossed = crossed_weights(along, box.half)
     edge = jnp.where(hollow, 0.5 * box.wall_m, 0.0)
     for sign in (1.0, -1.0):
         rows = []

@@ -129,6 +129,18 @@ def test_photons_from_the_ground_are_softer_and_are_counted(detectors: Detectors
     assert float(jnp.sum(rois)) == pytest.approx(float(jnp.sum(direct + with_ground)), rel=1e-3)
 
 
+def test_thick_walls_of_a_building_leave_the_same_of_the_ground_for_every_view(detectors: Detectors) -> None:
+    d, n = detectors["nai_2x2", "physical"], jnp.int32(0)
+
+    def shine(metres: float, ground: float, closed: float) -> np.ndarray:
+        return np.asarray(from_ground(d, n, shaped(through(d, concrete=metres), closed=closed, ground=ground)))
+
+    above, aside = shine(0.5, 0.9, 1.0), shine(0.5, 0.05, 1.0)
+    np.testing.assert_allclose(above, aside, rtol=1e-3)
+    assert (above < shine(0.5, 0.9, 0.0)).all()
+    np.testing.assert_allclose(shine(1e-6, 0.9, 1.0), shine(1e-6, 0.9, 0.0), rtol=1e-2)
+
+
 def test_the_ideal_detector_knows_no_ground(detectors: Detectors) -> None:
     d = detectors["nai_2x2", "paper_ideal"]
     assert AIR in d.material_names

@@ -161,6 +161,15 @@ def test_gradients_in_the_plane_of_a_face_can_be_used(a, b):
         assert np.max(np.abs(gradient)) < 1e5
 
 
+def test_how_low_the_lower_end_lies():
+    """Above the ground below it, whichever end it is; a house high above the ground sees nothing of it."""
+    site = make_site([((0, 0, 0), (3, 2, 4), 0.3, 0.0, "brick")], terrain=np.full((7, 7), 100.0))
+    for height, expected in ((0.5, 1.0 / 1.0625), (2.0, 0.5), (20.0, 1.0 / 101.0)):
+        one, other = jnp.array([0.0, 0.0, 100.0 + height]), jnp.array([30.0, 5.0, 130.0])
+        for ends in ((one, other), (other, one)):
+            assert float(crossed(site, *ends).shape.low) == pytest.approx(expected, rel=1e-3)
+
+
 def test_gradient_equals_difference():
     site = make_site([((0, 0, 0), (3, 2, 4), 0.3, 0.0, "brick")])
     a, b = jnp.array([-10.0, 1.0, 1.0]), jnp.array([12.0, 0.5, 2.0])
