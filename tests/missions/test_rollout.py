@@ -45,6 +45,18 @@ def test_the_mission_finds_locates_and_names_the_source(records):
         assert "Co-60" in record.finding
 
 
+def test_a_mission_knows_what_is_a_wall(simulation):
+    """Of the true site and of the presumed one: air and leaves surround, all else counts by its density."""
+    materials = simulation.scenario.materials
+    for site in (simulation.world.site, simulation.plan.presumed.site):
+        expected = [materials[name].density_kg_m3 for name in site.material_names]
+        expected = [
+            0.0 if name in ("air", "vegetation") else d for name, d in zip(site.material_names, expected, strict=True)
+        ]
+        np.testing.assert_allclose(site.wall_kg_m3, expected)
+        assert 0.0 in expected
+
+
 def test_phases_follow_one_another_and_vehicles_end_at_rest(records):
     for record in records:
         survey, search = record.phases
