@@ -80,6 +80,26 @@ def test_rates_with_slopes_are_the_rates_and_slopes_their_differences(
     assert np.max(np.abs(slopes - difference)) <= 0.15 * np.max(np.abs(difference))
 
 
+@pytest.mark.parametrize("name", ["Co-60", "Cs-137", "Am-241"])
+def test_slopes_by_leaves_are_those_of_what_surrounds(detectors: Detectors, name: str) -> None:
+    """Leaves beside air and walls: neither of them makes the other more of a wall."""
+    d = detectors["nai_1p5x1p5", "physical"]
+    k, leaves = d.nuclide_names.index(name), d.material_names.index("vegetation")
+    way, place, axis = ways(d, k, 24)
+    crowns = jnp.asarray(np.random.default_rng(k).uniform(0.5, 12.0, 24), jnp.float32)
+    assert way.shape is not None
+    shape = replace(way.shape, thin_m=way.shape.thin_m.at[:, leaves].set(crowns))
+    way = replace(way, length_m=way.length_m.at[:, leaves].set(crowns), shape=shape)
+    _, slopes = _with_slopes(d, source(k), way, place, axis, by=(leaves,))
+    # of all regions together, to which it does not matter that the spectrum softens
+    up, down = (
+        np.sum(_each(d, jnp.int32(k), thicker(way, leaves, np.exp(s)), place, axis), axis=1) for s in (0.05, -0.05)
+    )
+    difference = (up - down) / 0.1
+    found = np.sum(np.asarray(slopes)[:, 0], axis=1)
+    assert np.max(np.abs(found - difference)) <= 0.03 * np.max(np.abs(difference))
+
+
 def test_a_way_without_a_shape_has_wide_walls_and_no_ground(detectors: Detectors) -> None:
     d = detectors["nai_1p5x1p5", "physical"]
     way, place, axis = ways(d, 5, 6)
