@@ -17,6 +17,7 @@ of the model are alike in neighbouring windows, and a posterior that takes each 
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -87,6 +88,7 @@ class _Rounds:
     known: Weighed  # [Q, P]
     centres: jax.Array  # [Q, P, 3]
     roots: jax.Array  # [Q, 3, 3] of the covariance
+    mixture: jax.Array  # [Q, P] log density of all distributions together
     count: jax.Array  # [] int32 rounds done
 
 
@@ -121,6 +123,7 @@ def sample_posterior(
         known=empty,
         centres=jnp.zeros((rounds, per_round, 3)),
         roots=jnp.broadcast_to(jnp.eye(3), (rounds, 3, 3)),
+        mixture=jnp.full((rounds, per_round), -jnp.inf),
         count=jnp.int32(0),
     )
 
@@ -139,10 +142,7 @@ def sample_posterior(
         centres, about = placed(done)
         root = jnp.linalg.cholesky(about + LEAST_STD_M**2 * jnp.eye(3))
         drawn = each(weigh, centres + scales[:, None] * (normal[k] @ root.T), TOGETHER)
-        known = jax.tree.map(lambda all_, new: all_.at[k].set(new), done.known, drawn)
-        return _Rounds(
-            known=known, centres=done.centres.at[k].set(centres), roots=done.roots.at[k].set(root), count=k + 1
-        )  # fmt: skip
+        return _with_round(done, drawn, centres, root)
 
     def more(done: _Rounds) -> jax.Array:
         enough = _effective(_truncated(_log_weights(done))) >= ENOUGH_EFFECTIVE
@@ -189,30 +189,38 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array) ->
     return jnp.max(apart)
 
 
+def _with_round(done: _Rounds, drawn: Weighed, centres: jax.Array, root: jax.Array) -> _Rounds:
+    """The rounds and one more: places [P], and the distribution that they were drawn from."""
+    k = done.count
+    known = jax.tree.map(lambda all_, new: all_.at[k].set(new), done.known, drawn)
+    centres, roots = done.centres.at[k].set(centres), done.roots.at[k].set(root)
+    # the new distribution at all places, and those before it at the new places: the rest is known
+    places = known.place.reshape(-1, 3)
+    of_new = _log_density(places, places[0], centres[k], root).reshape(known.log_posterior.shape)
+    before = jax.vmap(partial(_log_density, drawn.place, places[0]))(centres, roots)
+    before = jnp.where(jnp.arange(len(roots))[:, None] < k, before, -jnp.inf)
+    mixture = done.mixture.at[k].set(jax.scipy.special.logsumexp(before, axis=0))
+    return _Rounds(known=known, centres=centres, roots=roots, mixture=jnp.logaddexp(mixture, of_new), count=k + 1)
+
+
+def _log_density(places: jax.Array, origin: jax.Array, centres: jax.Array, root: jax.Array) -> jax.Array:
+    """Log density [m] of a round's distribution at ``places`` [m, 3], up to a constant.
+
+    Those and its ``centres`` [P, 3] are taken relative to ``origin`` [3]: large coordinates would lose digits in
+    float32.
+    """
+    scales = _scales(centres.shape[0])
+    inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(3), lower=True)
+    turned = (places - origin) @ inverse.T
+    offset = (turned[:, None] - (centres - origin) @ inverse.T) / scales[:, None]
+    each_ = -0.5 * jnp.sum(offset * offset, axis=-1) - 3.0 * jnp.log(scales)
+    return jax.scipy.special.logsumexp(each_, axis=-1) - jnp.sum(jnp.log(jnp.diagonal(root)))
+
+
 def _log_weights(done: _Rounds) -> jax.Array:
     """Logarithms [Q, P] of posterior over mixture of the distributions of all rounds so far."""
-    known, scales = done.known, _scales(done.centres.shape[1])
-    inverse = _inverse(done.roots)
-
-    def of_round(k: jax.Array) -> jax.Array:
-        """Log density [Q P] of round ``k``."""
-        # relative to one of them: large coordinates would lose digits in float32
-        origin = done.centres[0, 0]
-        turned = (known.place.reshape(-1, 3) - origin) @ inverse[k].T
-        offset = (turned[:, None] - (done.centres[k] - origin) @ inverse[k].T) / scales[:, None]
-        each_ = -0.5 * jnp.sum(offset * offset, axis=-1) - 3.0 * jnp.log(scales)
-        log_scale = jnp.sum(jnp.log(jnp.diagonal(done.roots[k])))
-        return jnp.where(k < done.count, jax.scipy.special.logsumexp(each_, axis=-1) - log_scale, -jnp.inf)
-
-    density = jax.lax.map(of_round, jnp.arange(done.roots.shape[0]))
-    mixture = jax.scipy.special.logsumexp(density, axis=0).reshape(known.log_posterior.shape)
-    return jnp.where(jnp.isfinite(known.log_posterior), known.log_posterior - mixture, -jnp.inf)
-
-
-def _inverse(roots: jax.Array) -> jax.Array:
-    """Inverse [..., 3, 3] of lower triangles."""
-    eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
-    return jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
+    value = done.known.log_posterior
+    return jnp.where(jnp.isfinite(value), value - done.mixture, -jnp.inf)
 
 
 def _weights(log_weights: jax.Array, power: jax.Array | float = 1.0) -> jax.Array:
