@@ -8,9 +8,13 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.extend import core
 
 In = TypeVar("In")
 Out = TypeVar("Out")
+
+AT_A_TIME = 32  # missions for which an accelerator computes what only some of them need: each is much by itself
 
 _CORES: ContextVar[str | None] = ContextVar("swarmsim cores", default=None)
 
@@ -44,7 +48,10 @@ def each(function: Callable[[In], Out], values: In, together: int) -> Out:
         return jax.lax.map(function, values) if axis is None else _shared(function, values, count, axis)
     # equal parts: a rest would be compiled as well
     size = max(n for n in range(1, min(together, count) + 1) if count % n == 0)
-    return jax.lax.map(function, values, batch_size=size)
+    parts = jax.tree.map(lambda x: x.reshape(count // size, size, *x.shape[1:]), values)
+    found = jax.lax.map(jax.vmap(function), parts)
+    # with both sizes: arrays of no material have no entries from which one of them would follow
+    return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), found)
 
 
 def _shared(function: Callable[[In], Out], values: In, count: int, axis: str) -> Out:
@@ -91,3 +98,83 @@ def switch(number: jax.Array, branches: Sequence[Callable[[], Out]]) -> Out:
     if on_processor():
         return jax.lax.switch(number, branches)
     return jax.tree.map(lambda *leaves: jax.lax.select_n(number, *leaves), *(branch() for branch in branches))
+
+
+def for_those(predicate: jax.Array, one: Callable[[], Out], other: Callable[[], Out]) -> Out:
+    """The result of ``one`` where ``predicate`` [] holds, else that of ``other``, which costs next to nothing.
+
+    Unlike `either` it is for what takes long and few missions need at a time: an accelerator computes ``one`` for those
+    that need it alone, `AT_A_TIME` together.
+    """
+    if on_processor():
+        return jax.lax.cond(predicate, one, other)
+    closed = jax.make_jaxpr(one)()
+    least, structure = jax.tree.flatten(other())
+    leaves = [jnp.asarray(x, aval.dtype) for x, aval in zip(least, closed.out_avals, strict=True)]
+
+    def evaluate(*consts: Any) -> list[jax.Array]:
+        return list(core.jaxpr_as_fun(core.ClosedJaxpr(closed.jaxpr, consts))())
+
+    return jax.tree.unflatten(structure, _chosen(evaluate, predicate, leaves, closed.consts))
+
+
+def repeat_while(more: Callable[[Out], jax.Array], step: Callable[[Out], Out], start: Out) -> Out:
+    """`jax.lax.while_loop`, of which an accelerator computes a ``step`` for the missions that go on alone."""
+    if on_processor():
+        return jax.lax.while_loop(more, step, start)
+    return jax.lax.while_loop(more, lambda x: for_those(more(x), lambda: step(x), lambda: x), start)
+
+
+def _chosen(
+    evaluate: Callable[..., list[jax.Array]], predicate: jax.Array, other: list[jax.Array], consts: Sequence[Any]
+) -> list[jax.Array]:
+    """``evaluate(*consts)`` where ``predicate`` [] holds, else ``other``."""
+
+    @custom_vmap
+    def chosen(predicate: jax.Array, other: list[jax.Array], consts: list[Any]) -> list[jax.Array]:
+        return jax.lax.cond(predicate, lambda: evaluate(*consts), lambda: other)
+
+    @chosen.def_vmap
+    def of_many(size: int, own: Any, predicate: jax.Array, other: list[jax.Array], consts: list[Any]) -> Any:
+        apart, own_other, own_consts = own
+        axes = [0 if x else None for x in own_consts]
+        other = [x if y else _repeated(x, size) for x, y in zip(other, own_other, strict=True)]
+        every = [True] * len(other)
+        if apart:
+            return _in_groups(evaluate, predicate, other, consts, axes), every
+
+        def alike(*consts: Any) -> list[jax.Array]:
+            return [_repeated(x, size) for x in evaluate(*consts)]
+
+        many = jax.vmap(evaluate, in_axes=axes, axis_size=size) if any(own_consts) else alike
+        return _chosen(many, predicate, other, consts), every
+
+    return chosen(predicate, other, list(consts))
+
+
+def _repeated(x: Any, size: int) -> jax.Array:
+    return jnp.broadcast_to(jnp.asarray(x), (size, *np.shape(x)))
+
+
+def _in_groups(
+    evaluate: Callable[..., list[jax.Array]],
+    predicate: jax.Array,
+    other: list[jax.Array],
+    consts: list[Any],
+    axes: list[int | None],
+) -> list[jax.Array]:
+    """``other`` [B, ...] with the results for those where ``predicate`` [B] holds, a group of them after another."""
+    size = predicate.shape[0]
+    group = min(AT_A_TIME, size)
+    count = jnp.sum(predicate)
+    order = jnp.append(jnp.argsort(~predicate, stable=True), jnp.zeros(group, jnp.int32))
+    together = jax.vmap(evaluate, in_axes=axes, axis_size=group)
+
+    def take(number: jax.Array, results: list[jax.Array]) -> list[jax.Array]:
+        at = jax.lax.dynamic_slice(order, (number * group,), (group,))
+        found = together(*[x if axis is None else x[at] for x, axis in zip(consts, axes, strict=True)])
+        # what fills the last group up is dropped
+        rows = jnp.where(number * group + jnp.arange(group) < count, at, size)
+        return [x.at[rows].set(y, mode="drop") for x, y in zip(results, found, strict=True)]
+
+    return jax.lax.fori_loop(0, -(-count // group), take, other)

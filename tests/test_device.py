@@ -18,6 +18,8 @@ def test_each_is_the_function_of_every_element(processor, count):
     values = {"a": jnp.arange(float(count)), "b": jnp.arange(2.0 * count).reshape(count, 2)}
     found = jax.jit(lambda v: device.each(lambda x: x["a"] * x["b"].sum(), v, 5))(values)
     np.testing.assert_array_equal(found, values["a"] * values["b"].sum(axis=1))
+    empty = jax.jit(lambda v: device.each(lambda x: jnp.zeros((3, 0)), v, 4))(values)
+    assert empty.shape == (count, 3, 0)
 
 
 def test_branches_are_chosen_by_each_mission(processor):
@@ -29,3 +31,45 @@ def test_branches_are_chosen_by_each_mission(processor):
     first, second = jax.jit(jax.vmap(lambda n: device.either(n == 0, *branches)))(numbers)
     np.testing.assert_array_equal(first, [2.0, 1.0, 2.0])
     np.testing.assert_array_equal(second[:, 1], [1.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("few", [1, 2, 32])
+def test_those_that_need_it_are_computed_in_groups(processor, monkeypatch, few):
+    monkeypatch.setattr(device, "AT_A_TIME", few)
+    shared, own = jnp.arange(3.0), jnp.arange(7.0)
+
+    def one(x, wanted):
+        many = device.for_those(wanted, lambda: {"a": x * shared, "b": jnp.int32(1)}, lambda: {"a": -shared, "b": 0})
+        # decided for a mission, computed for several places of it
+        places = jax.vmap(lambda y: device.for_those(wanted, lambda: y + x, lambda: y))(shared)
+        alike = jax.vmap(lambda y: device.for_those(wanted, lambda: x, lambda: y))(shared)
+        return many, places, alike
+
+    wanted = jnp.array([True, False, True, True, False, False, True])
+    many, places, alike = jax.jit(jax.vmap(one))(own, wanted)
+    chosen = np.asarray(wanted)[:, None]
+    np.testing.assert_array_equal(many["a"], np.where(chosen, np.outer(own, shared), -np.asarray(shared)))
+    np.testing.assert_array_equal(many["b"], wanted)
+    np.testing.assert_array_equal(places, np.asarray(shared) + np.where(chosen, np.asarray(own)[:, None], 0.0))
+    np.testing.assert_array_equal(alike, np.where(chosen, np.asarray(own)[:, None], np.asarray(shared)))
+
+
+def test_missions_repeat_as_often_as_each_of_them_goes_on(processor, monkeypatch):
+    monkeypatch.setattr(device, "AT_A_TIME", 2)
+
+    def one(most, factor):
+        def step(carry):
+            k, x = carry
+            inner = device.repeat_while(lambda y: y < k, lambda y: y + 1, jnp.int32(0))
+            return k + 1, x * factor + inner.astype(jnp.float32)
+
+        return device.repeat_while(lambda carry: carry[0] < most, step, (jnp.int32(0), jnp.float32(1.0)))
+
+    most, factor = jnp.array([0, 3, 5, 1, 4]), jnp.linspace(0.5, 1.5, 5)
+    times, values = jax.jit(jax.vmap(one))(most, factor)
+    np.testing.assert_array_equal(times, most)
+    for n, f, value in zip(most.tolist(), factor.tolist(), values, strict=True):
+        x = 1.0
+        for k in range(n):
+            x = x * f + k
+        assert float(value) == pytest.approx(x, rel=1e-6)

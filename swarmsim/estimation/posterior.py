@@ -22,7 +22,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import each, either
+from swarmsim.device import each, for_those, repeat_while
 from swarmsim.estimation.fit import alone, settle
 from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
@@ -148,7 +148,7 @@ def sample_posterior(
         enough = _effective(_truncated(_log_weights(done))) >= ENOUGH_EFFECTIVE
         return (done.count < rounds) & ~(enough & (done.count >= LEAST_ROUNDS))
 
-    done = jax.lax.while_loop(more, round_, nowhere)
+    done = repeat_while(more, round_, nowhere)
     return _summary(done)
 
 
@@ -280,7 +280,7 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> t
     def one(k: jax.Array) -> Posterior:
         zero = jnp.zeros(())
         nothing = Posterior(mean=jnp.zeros(4), covariance=jnp.eye(4), effective=zero, halves=zero)
-        return either(s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing)
+        return for_those(s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing)
 
     return jax.lax.map(one, jnp.arange(s.present.shape[0])), goodness(problem, state)
 

@@ -11,7 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import either, switch
+from swarmsim.device import for_those, repeat_while, switch
 from swarmsim.estimation.fit import FLAT, Settled, without_more
 from swarmsim.estimation.forward import Problem, Rates, rates, variance_of, ways_from
 from swarmsim.estimation.likelihood import position_of
@@ -110,7 +110,7 @@ def signals(problem: Problem, s: Sources, lengths: jax.Array) -> Others:
             found = rates(problem, ways, nuclide, lengths)
             return Others(counts=activity * found.counts, variance=variance_of(problem, ways.position_m) + found.edge)
 
-        return either(there, seen, lambda: Others(counts=jnp.zeros((n, regions)), variance=jnp.zeros(n)))
+        return for_those(there, seen, lambda: Others(counts=jnp.zeros((n, regions)), variance=jnp.zeros(n)))
 
     return jax.lax.map(one, (s.place, s.nuclide, s.activity_bq, s.present))
 
@@ -166,7 +166,7 @@ def find_sources(
         full = jnp.all(p.state.sources.present) & ~jnp.any(p.again)
         return replace(p, over=p.over | full | (p.left <= 0))
 
-    end = jax.lax.while_loop(lambda p: ~p.over, step, start)
+    end = repeat_while(lambda p: ~p.over, step, start)
     # a trial that found no end has shown nothing
     return jax.tree.map(partial(jnp.where, end.trial), end.before, end.state)
 
@@ -186,7 +186,7 @@ def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.
         less = replace(less, trial=ratio[k] >= least, again=less.state.sources.present)
         return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * least), less, p)
 
-    return either(now, begin, lambda: p)
+    return for_those(now, begin, lambda: p)
 
 
 def _ended_trial(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
@@ -216,7 +216,7 @@ def _sought(
         return Starts(point_m=points_m[index], nuclide=scanned.nuclide[index]), statistic[0]
 
     nothing = Starts(point_m=jnp.zeros((STARTS, 3)), nuclide=jnp.zeros(STARTS, jnp.int32))
-    starts, statistic = either(adding | wide, first_look, lambda: (nothing, jnp.zeros(())))
+    starts, statistic = for_those(adding | wide, first_look, lambda: (nothing, jnp.zeros(())))
 
     def look() -> tuple[State, jax.Array]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
@@ -229,7 +229,7 @@ def _sought(
         return jax.tree.map(partial(jnp.where, found), after, state), found
 
     worth = ~adding | (statistic > PROMISING * params.threshold)
-    return either(worth, look, lambda: (state, jnp.array(False)))
+    return for_those(worth, look, lambda: (state, jnp.array(False)))
 
 
 def _best(
@@ -310,7 +310,7 @@ def _best(
         return (number < reaches.shape[0]) & ~hopeless
 
     start = (first, as_known(problem, state, slot, adding), jnp.zeros(known))
-    return jax.lax.while_loop(on, round_, start)[1:]
+    return repeat_while(on, round_, start)[1:]
 
 
 def as_known(problem: Problem, state: State, slot: jax.Array, adding: jax.Array) -> Tried:
@@ -390,6 +390,6 @@ def ratios(problem: Problem, state: State) -> jax.Array:
             rest = without(state, k).added
             return 2.0 * (state.likelihood - without_more(problem, rest, state.unknowns, ALONE_STEPS)[1])
 
-        return either(state.sources.present[k], look, lambda: jnp.zeros(()))
+        return for_those(state.sources.present[k], look, lambda: jnp.zeros(()))
 
     return jax.lax.map(one, jnp.arange(state.sources.present.shape[0]))

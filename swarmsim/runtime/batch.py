@@ -22,7 +22,7 @@ from swarmsim.scalars import Layout
 
 SMALL = 4096  # elements up to which an array carries the mission axis whether or not missions differ in it
 MANY_VEHICLES = 1024  # of all missions on a device
-TOGETHER = 256  # missions that an accelerator estimates in step; a processor core takes one, which fits its cache
+TOGETHER = 512  # missions that an accelerator estimates in step; a processor core takes one, which fits its cache
 
 
 def layout_for(vehicles: int) -> Layout:
