@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from threading import Thread
 from typing import Any, TypeVar
 
 import jax
@@ -24,6 +23,7 @@ from swarmsim.runtime.clock import Clock, Source
 from swarmsim.runtime.environment import environment, settings
 from swarmsim.runtime.executables import Executable, Executables, UnstorableError, cache_reads, load
 from swarmsim.runtime.fingerprint import UnidentifiableError, fingerprint, sharding_text
+from swarmsim.runtime.waiting import waited_for
 
 # Settings that may change between two calls of a program; the others are set once, before JAX starts.
 _CHANGEABLE = ("jax_enable_x64", "jax_default_matmul_precision", "jax_debug_nans", "jax_default_device")
@@ -81,7 +81,7 @@ class Program:
         call, tree = self._last[1]
         start = time.perf_counter()
         results = call(*leaves)
-        _waited_for(lambda: jax.block_until_ready(results[-1:]))  # an executable's results are ready together
+        waited_for(lambda: jax.block_until_ready(results[-1:]))  # an executable's results are ready together
         self._clock.add("ran", self.name, time.perf_counter() - start)
         return jax.tree.unflatten(tree, results)
 
@@ -155,7 +155,7 @@ class Program:
             before = cache_reads()  # of this thread
             return _machine_code(lowered), cache_reads() > before
 
-        code, read = _waited_for(compiled)
+        code, read = waited_for(compiled)
         return (code, trees[0]), read
 
     def _key(self, leaves: Sequence[Any], structure: Any) -> str | None:
@@ -298,17 +298,3 @@ def _strongly_typed(result: Any) -> Any:
 def _leaf_text(leaf: Any) -> str:
     shape, dtype, weak_type, sharding = _leaf(leaf)
     return f"{shape} {dtype} {weak_type} {sharding_text(sharding) if sharding is not None else 'anywhere'}"
-
-
-def _waited_for(long: Callable[[], T]) -> T:
-    """The value of ``long``, which another thread computes: Ctrl-C interrupts waiting, but not XLA itself."""
-    future: Future[T] = Future()
-
-    def compute() -> None:
-        try:
-            future.set_result(long())
-        except BaseException as error:  # goes to the thread that waits
-            future.set_exception(error)
-
-    Thread(target=compute, name="swarmsim-wait", daemon=True).start()
-    return future.result()

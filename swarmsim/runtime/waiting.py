@@ -1,0 +1,52 @@
+"""Waiting for what takes long such that Ctrl-C interrupts it."""
+
+import threading
+import weakref
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import SimpleQueue
+from threading import Thread
+from typing import TypeVar
+
+T = TypeVar("T")
+
+_waiters = threading.local()  # the one of each thread that is idle
+
+
+def waited_for(long: Callable[[], T]) -> T:
+    """The value of ``long``, which another thread computes: Ctrl-C interrupts waiting, but not XLA itself."""
+    future: Future[T] = Future()
+
+    def compute() -> None:
+        try:
+            future.set_result(long())
+        except BaseException as error:  # goes to the thread that waits
+            future.set_exception(error)
+
+    waiter: _Waiter = getattr(_waiters, "idle", None) or _Waiter()
+    _waiters.idle = None  # one that goes on computing after Ctrl-C is left behind
+    waiter.work.put(compute)
+    try:
+        return future.result()
+    finally:
+        if future.done():
+            _waiters.idle = waiter
+
+
+class _Waiter:
+    """A thread that computes one thing after another for the thread that made it, as long as that one wants it.
+
+    It is not made anew for each: the memory allocator of a process that has compiled much hands thousands of free
+    pieces to every new thread and takes them back when it ends, which takes up to 20 ms.
+    """
+
+    def __init__(self) -> None:
+        self.work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        Thread(target=_serve, args=(self.work,), name="swarmsim-wait", daemon=True).start()
+        weakref.finalize(self, self.work.put, None)
+
+
+def _serve(work: SimpleQueue[Callable[[], None] | None]) -> None:
+    while (compute := work.get()) is not None:
+        compute()
+        del compute  # and what it refers to

@@ -1,0 +1,49 @@
+"""Another thread computes what is waited for, the same one each time unless it is interrupted."""
+
+import signal
+import threading
+import time
+
+import pytest
+
+from swarmsim.runtime.waiting import waited_for
+
+
+def test_values_and_errors_come_from_one_thread_that_is_kept():
+    first = waited_for(threading.get_ident)
+    assert first != threading.get_ident()
+    assert [waited_for(threading.get_ident) for _ in range(3)] == [first] * 3
+    with pytest.raises(ValueError, match="no"):
+        waited_for(lambda: int("no"))
+    assert waited_for(threading.get_ident) == first
+
+
+def test_what_waits_within_has_a_thread_of_its_own():
+    outer, inner = waited_for(lambda: (threading.get_ident(), waited_for(threading.get_ident)))
+    assert len({outer, inner, threading.get_ident()}) == 3
+
+
+def test_ctrl_c_ends_the_waiting_and_another_thread_goes_on():
+    done = threading.Event()
+
+    def long() -> None:
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        done.wait(20.0)
+
+    before = waited_for(threading.get_ident)
+    with pytest.raises(KeyboardInterrupt):
+        waited_for(long)
+    assert waited_for(threading.get_ident) != before
+    done.set()
+
+
+def test_a_thread_that_ends_leaves_no_other_behind():
+    seen: list[int] = []
+    thread = threading.Thread(target=lambda: seen.append(waited_for(threading.get_ident)))
+    thread.start()
+    thread.join()
+    for _ in range(200):
+        if seen[0] not in {one.ident for one in threading.enumerate()}:
+            return
+        time.sleep(0.05)
+    pytest.fail("the thread that computed for it goes on")
