@@ -1,5 +1,6 @@
 """Waiting for what takes long such that Ctrl-C interrupts it."""
 
+import os
 import threading
 import weakref
 from collections.abc import Callable
@@ -11,6 +12,8 @@ from typing import TypeVar
 T = TypeVar("T")
 
 _waiters = threading.local()  # the one of each thread that is idle
+if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
+    os.register_at_fork(after_in_child=lambda: _waiters.__dict__.clear())  # of the thread that goes on there
 
 
 def waited_for(long: Callable[[], T]) -> T:

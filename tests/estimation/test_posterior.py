@@ -8,12 +8,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.stats import multivariate_normal
 
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.posterior import WEIGH_STEPS, Weighed, mirrored_place, posteriors, sample_posterior
+from swarmsim.estimation.posterior import (
+    SCALES,
+    WEIGH_STEPS,
+    Weighed,
+    _log_weights,
+    _Rounds,
+    _with_round,
+    mirrored_place,
+    posteriors,
+    sample_posterior,
+)
 from swarmsim.estimation.search import attempt
 from swarmsim.estimation.sources import Sources, no_sources
 from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
@@ -199,3 +210,36 @@ def test_a_straight_way_does_not_tell_its_sides_apart():
     across = float(normal @ np.asarray(found.covariance)[:2, :2] @ normal)
     assert np.sqrt(across) == pytest.approx(side, rel=0.15)
     assert float(found.effective) > 16.0
+
+
+def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
+    rng = np.random.default_rng(0)
+    rounds, per_round, drawn = 6, 16, 4
+    none = jnp.zeros((rounds, per_round))
+    empty = Weighed(
+        place=jnp.zeros((rounds, per_round, 3)), log_activity=none, variance=none, log_posterior=none - jnp.inf
+    )
+    done = _Rounds(
+        known=empty, centres=empty.place, roots=jnp.broadcast_to(jnp.eye(3), (rounds, 3, 3)),
+        mixture=none - jnp.inf, count=jnp.int32(0),
+    )  # fmt: skip
+    places, centres, roots = [], [], []
+    for _ in range(drawn):
+        # far from the origin of the site, and from one round to the next
+        centres.append((rng.normal(size=(per_round, 3)) * 2.0 + [3000.0, -2000.0, 1.0]).astype(np.float32))
+        roots.append((np.tril(rng.normal(size=(3, 3)) * 0.2) + np.diag([0.7, 1.0, 0.5])).astype(np.float32))
+        places.append((centres[-1] + rng.normal(size=(per_round, 3))).astype(np.float32))
+        new = Weighed(
+            place=jnp.asarray(places[-1]), log_activity=none[0], variance=none[0], log_posterior=none[0] + 1.0
+        )
+        done = _with_round(done, new, jnp.asarray(centres[-1]), jnp.asarray(roots[-1]))
+    scales = np.resize(SCALES, per_round)
+    at = np.concatenate(places).astype(np.float64)
+    density = np.zeros(len(at))
+    for centre, root in zip(centres, roots, strict=True):
+        for c, scale in zip(centre.astype(np.float64), scales, strict=True):
+            density += multivariate_normal(c, scale**2 * root.astype(np.float64) @ root.T).pdf(at)
+    weights = np.asarray(_log_weights(done))
+    found, expected = weights[:drawn].reshape(-1), 1.0 - np.log(density)
+    np.testing.assert_allclose(found - found[0], expected - expected[0], atol=2e-3)
+    assert np.all(weights[drawn:] == -np.inf)

@@ -1,6 +1,9 @@
 """Another thread computes what is waited for, the same one each time unless it is interrupted."""
 
+import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -47,3 +50,28 @@ def test_a_thread_that_ends_leaves_no_other_behind():
             return
         time.sleep(0.05)
     pytest.fail("the thread that computed for it goes on")
+
+
+FORKS = """
+import os, signal, threading
+from swarmsim.runtime.waiting import waited_for
+
+def fork():
+    assert waited_for(lambda: 1) == 1
+    child = os.fork()
+    if child == 0:
+        signal.alarm(20)
+        os._exit(waited_for(lambda: 7))
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+
+fork()
+thread = threading.Thread(target=fork)
+thread.start()
+thread.join()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_process_makes_a_thread_of_its_own():
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", FORKS], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["7", "7"]
