@@ -104,18 +104,21 @@ def for_those(predicate: jax.Array, one: Callable[[], Out], other: Callable[[], 
     """The result of ``one`` where ``predicate`` [] holds, else that of ``other``, which costs next to nothing.
 
     Unlike `either` it is for what takes long and few missions need at a time: an accelerator computes ``one`` for those
-    that need it alone, `AT_A_TIME` together.
+    that need it alone, `AT_A_TIME` together. It is not to be differentiated there.
     """
     if on_processor():
         return jax.lax.cond(predicate, one, other)
-    closed = jax.make_jaxpr(one)()
-    least, structure = jax.tree.flatten(other())
+    closed, shapes = jax.make_jaxpr(one, return_shape=True)()
+    structure: Any = jax.tree.structure(shapes)
+    least, found = jax.tree.flatten(other())
+    if structure != found:
+        raise TypeError(f"the results differ in structure: {structure} and {found}")
     leaves = [jnp.asarray(x, aval.dtype) for x, aval in zip(least, closed.out_avals, strict=True)]
 
     def evaluate(*consts: Any) -> list[jax.Array]:
         return list(core.jaxpr_as_fun(core.ClosedJaxpr(closed.jaxpr, consts))())
 
-    return jax.tree.unflatten(structure, _chosen(evaluate, predicate, leaves, closed.consts))
+    return jax.tree.unflatten(structure, _chosen(evaluate, jnp.asarray(predicate, bool), leaves, closed.consts))
 
 
 def repeat_while(more: Callable[[Out], jax.Array], step: Callable[[Out], Out], start: Out) -> Out:
@@ -137,6 +140,8 @@ def _chosen(
     @chosen.def_vmap
     def of_many(size: int, own: Any, predicate: jax.Array, other: list[jax.Array], consts: list[Any]) -> Any:
         apart, own_other, own_consts = own
+        if not (apart or any(own_other) or any(own_consts)):  # JAX asks so for a derivative's sake
+            return jax.lax.cond(predicate, lambda: evaluate(*consts), lambda: other), [False] * len(other)
         axes = [0 if x else None for x in own_consts]
         other = [x if y else _repeated(x, size) for x, y in zip(other, own_other, strict=True)]
         every = [True] * len(other)
@@ -172,9 +177,12 @@ def _in_groups(
 
     def take(number: jax.Array, results: list[jax.Array]) -> list[jax.Array]:
         at = jax.lax.dynamic_slice(order, (number * group,), (group,))
+        asked = number * group + jnp.arange(group) < count
+        # What fills the last group up is the first of it again: another one's state may be one that no loop ends from,
+        # and what it asks for inside would be computed too.
+        at = jnp.where(asked, at, at[0])
         found = together(*[x if axis is None else x[at] for x, axis in zip(consts, axes, strict=True)])
-        # what fills the last group up is dropped
-        rows = jnp.where(number * group + jnp.arange(group) < count, at, size)
+        rows = jnp.where(asked, at, size)  # the rest is dropped
         return [x.at[rows].set(y, mode="drop") for x, y in zip(results, found, strict=True)]
 
     return jax.lax.fori_loop(0, -(-count // group), take, other)

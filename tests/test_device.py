@@ -54,6 +54,47 @@ def test_those_that_need_it_are_computed_in_groups(processor, monkeypatch, few):
     np.testing.assert_array_equal(alike, np.where(chosen, np.asarray(own)[:, None], np.asarray(shared)))
 
 
+def test_groups_are_filled_up_with_none_that_would_take_longer(monkeypatch):
+    """The second of two missions would take 10^7 passes, and does not ask for any."""
+    monkeypatch.setattr(device, "on_processor", lambda: False)
+    counted: list[int] = []
+
+    def one(wanted, passes):
+        def long():
+            count = jax.lax.while_loop(lambda k: k < passes, lambda k: k + 1, 0)
+            jax.debug.callback(lambda most: counted.append(int(most)), passes)
+            return count
+
+        return device.for_those(wanted, long, lambda: -1)
+
+    found = jax.jit(jax.vmap(one))(jnp.array([True, False]), jnp.array([3, 10**7]))
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, [3, -1])
+    assert counted == [3, 3]
+
+
+def test_any_predicate_tells_true_from_false(processor):
+    def one(number, x):
+        return device.for_those(number != 0, lambda: x + 1.0, lambda: x)
+
+    many = jax.jit(jax.vmap(one))(jnp.array([0, 1, 2, 0, 5]), jnp.zeros(5))
+    np.testing.assert_array_equal(many, [0.0, 1.0, 1.0, 0.0, 1.0])
+
+
+def test_results_of_another_structure_are_refused(processor):
+    with pytest.raises(TypeError, match="structure"):
+        jax.vmap(lambda wanted: device.for_those(wanted, lambda: {"a": 1.0}, lambda: {"b": 1.0}))(jnp.array([True]))
+
+
+def test_derivatives_along_a_direction(processor):
+    def one(wanted, x):
+        return device.for_those(wanted, lambda: jnp.sin(x), lambda: x)
+
+    wanted, x = jnp.array([True, False, True]), jnp.array([0.3, 0.5, 0.7])
+    slope = jax.jit(jax.vmap(lambda p, x: jax.jvp(lambda x: one(p, x), (x,), (1.0,))[1]))(wanted, x)
+    np.testing.assert_allclose(slope, np.where(wanted, np.cos(x), 1.0), rtol=1e-6)
+
+
 def test_missions_repeat_as_often_as_each_of_them_goes_on(processor, monkeypatch):
     monkeypatch.setattr(device, "AT_A_TIME", 2)
 

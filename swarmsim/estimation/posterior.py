@@ -133,7 +133,7 @@ def sample_posterior(
         mean, about = _moments(done.known.place, weight)
         likely = _drawn_evenly(done.known.place.reshape(-1, 3), weight.reshape(-1), per_round)
         wide = jnp.arange(per_round)[:, None] % len(SCALES) < ABOUT_MEAN
-        first = done.count == 0
+        first = ~_any_weight(done)
         centres = jnp.where(first, starts, jnp.where(wide, mean, likely))
         return centres, jnp.where(first, (FIRST_SPREAD / SCALES[1]) ** 2 * covariance, about)
 
@@ -145,7 +145,7 @@ def sample_posterior(
         return _with_round(done, drawn, centres, root)
 
     def more(done: _Rounds) -> jax.Array:
-        enough = _effective(_truncated(_log_weights(done))) >= ENOUGH_EFFECTIVE
+        enough = _worth(done) >= ENOUGH_EFFECTIVE
         return (done.count < rounds) & ~(enough & (done.count >= LEAST_ROUNDS))
 
     done = repeat_while(more, round_, nowhere)
@@ -157,11 +157,11 @@ def _summary(done: _Rounds) -> Posterior:
     weight = _flattened(log_weights, LEAST_EFFECTIVE)
     values = jnp.concatenate([known.place, known.log_activity[..., None]], axis=-1)
     mean, covariance = _moments(values, weight)
-    covariance = covariance.at[3, 3].add(jnp.sum(weight * known.variance))
+    covariance = covariance.at[3, 3].add(jnp.sum(jnp.where(weight > 0.0, weight * known.variance, 0.0)))
     return Posterior(
         mean=mean,
         covariance=covariance,
-        effective=_effective(_truncated(log_weights)),
+        effective=_worth(done),
         halves=_halves(values, log_weights, covariance),
     )
 
@@ -221,6 +221,16 @@ def _log_weights(done: _Rounds) -> jax.Array:
     """Logarithms [Q, P] of posterior over mixture of the distributions of all rounds so far."""
     value = done.known.log_posterior
     return jnp.where(jnp.isfinite(value), value - done.mixture, -jnp.inf)
+
+
+def _any_weight(done: _Rounds) -> jax.Array:
+    """Whether [] a place that the posterior does not rule out has been found."""
+    return jnp.any(jnp.isfinite(_log_weights(done)))
+
+
+def _worth(done: _Rounds) -> jax.Array:
+    """How many independent places [] the weighted ones are worth."""
+    return jnp.where(_any_weight(done), _effective(_truncated(_log_weights(done))), 0.0)
 
 
 def _weights(log_weights: jax.Array, power: jax.Array | float = 1.0) -> jax.Array:

@@ -5,6 +5,7 @@ executable is looked up in this process, then in the user's cache folder (see `s
 the function traced and compiled. JAX's own compilation cache is not needed and not touched.
 """
 
+import contextlib
 import gc
 import hashlib
 import itertools
@@ -14,11 +15,11 @@ import time
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import jax
 
+from swarmsim.device import on_processor
 from swarmsim.runtime.clock import Clock, Source
 from swarmsim.runtime.environment import environment, settings
 from swarmsim.runtime.executables import Executable, Executables, UnstorableError, cache_reads, load
@@ -149,7 +150,8 @@ class Program:
         flat.__name__ = self.name.replace(" ", "_")  # what profilers show
         ends = [0, *itertools.accumulate(len(jax.tree.leaves(argument)) for argument in arguments)]
         donated = [leaf for number in self._donate for leaf in range(ends[number], ends[number + 1])]
-        lowered = jax.jit(flat, donate_argnums=donated).lower(*leaves)
+        with _full_precision():
+            lowered = jax.jit(flat, donate_argnums=donated).lower(*leaves)
 
         def compiled() -> tuple[Callable[..., Any], bool]:
             before = cache_reads()  # of this thread
@@ -172,6 +174,16 @@ class Program:
         if not hasattr(self, "_fingerprint"):
             self._fingerprint = fingerprint((self._function, self._identity))
         return self._fingerprint
+
+
+def _full_precision() -> contextlib.AbstractContextManager[Any]:
+    """Products of float32 matrices as such, while a program is traced.
+
+    An accelerator would round their factors to 10 bits of mantissa (TF32 of Nvidia's). A precision that the user has
+    set stays.
+    """
+    chosen = jax.config.values["jax_default_matmul_precision"] is not None
+    return contextlib.nullcontext() if chosen or on_processor() else jax.default_matmul_precision("float32")
 
 
 def _machine_code(lowered: Any) -> Any:
@@ -212,7 +224,7 @@ def forget() -> None:
     _EXECUTABLES.clear()
 
 
-@contextmanager
+@contextlib.contextmanager
 def uncollected() -> Iterator[None]:
     """Pause the cyclic garbage collector, which takes 25 % of the time of tracing."""
     enabled = gc.isenabled()

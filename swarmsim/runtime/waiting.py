@@ -45,8 +45,9 @@ class _Waiter:
 
     def __init__(self) -> None:
         self.work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        end = weakref.finalize(self, self.work.put, None)  # before the thread begins: Ctrl-C may come in between
+        end.atexit = False  # what is called while the interpreter ends may still wait
         Thread(target=_serve, args=(self.work,), name="swarmsim-wait", daemon=True).start()
-        weakref.finalize(self, self.work.put, None)
 
 
 def _serve(work: SimpleQueue[Callable[[], None] | None]) -> None:

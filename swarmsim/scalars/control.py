@@ -1,6 +1,7 @@
 """Loops, branches and functions with derivatives of their own, on scalars of all vehicles."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -157,29 +158,82 @@ def _joined(interpreter: Interpreter, rows: list[Value], aval: Any) -> Value:
     return Whole(jnp.stack([jnp.asarray(interpreter.put_together(x, one)[0]) for x in rows]), False)
 
 
+@dataclass(frozen=True)
+class _While:
+    """A `jax.lax.while_loop` on scalars."""
+
+    test: Any
+    body: Any
+    test_consts: list[Value]
+    consts: list[Value]
+    carry: list[Value]
+
+    @classmethod
+    def of(cls, equation: Any, values: list[Value]) -> "_While":
+        p = equation.params
+        first, split = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
+        return cls(p["cond_jaxpr"], p["body_jaxpr"], values[:first], values[first:split], values[split:])
+
+    @property
+    def avals(self) -> list[Any]:
+        """Types of what is carried."""
+        return [v.aval for v in self.body.jaxpr.invars[len(self.consts) :]]
+
+    def going(self, interpreter: Interpreter, carried: list[Any], flags: list[bool], mapped: bool) -> Any:
+        """Whether it goes on, for all or for each vehicle [N]."""
+        inner = interpreter.inner()
+        own = _load_all(inner, carried, self.avals, flags)
+        (going,) = inner.run(self.test, [*inner.enter(self.test_consts), *own])
+        (array,) = _dump_all(inner, [going], [self.test.jaxpr.outvars[0].aval], [mapped])
+        return array
+
+    def step(self, interpreter: Interpreter, carried: list[Any], flags: list[bool]) -> list[Any]:
+        """What is carried after the body."""
+        inner = interpreter.inner()
+        own = _load_all(inner, carried, self.avals, flags)
+        return _dump_all(inner, inner.run(self.body, [*inner.enter(self.consts), *own]), self.avals, flags)
+
+
 def _while(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[Value]:
-    p = equation.params
-    of_test, of_body = p["cond_nconsts"], p["body_nconsts"]
-    test_consts, consts, carry = values[:of_test], values[of_test : of_test + of_body], values[of_test + of_body :]
-    avals = [v.aval for v in p["body_jaxpr"].jaxpr.invars[of_body:]]
-    flags = _carried(p["body_jaxpr"], [is_mapped(x) for x in consts], [is_mapped(x) for x in carry], [])
-    if any(_flow(p["cond_jaxpr"], [*(is_mapped(x) for x in test_consts), *flags])):
+    loop = _While.of(equation, values)
+    flags = _carried(loop.body, [is_mapped(x) for x in loop.consts], [is_mapped(x) for x in loop.carry], [])
+    if any(_flow(loop.test, [*(is_mapped(x) for x in loop.test_consts), *flags])):
         raise NotWritableError  # every vehicle has an end of its own: left to jax.vmap
-    interpreter.settle([*test_consts, *consts])
+    interpreter.settle([*loop.test_consts, *loop.consts])
 
     def test(carried: list[Any]) -> Any:
-        inner = interpreter.inner()
-        own = _load_all(inner, carried, avals, flags)
-        (going,) = inner.run(p["cond_jaxpr"], [*inner.enter(test_consts), *own])
-        return jnp.asarray(inner.put_together(going, p["cond_jaxpr"].jaxpr.outvars[0].aval)[0])
+        return loop.going(interpreter, carried, flags, False)
 
     def step(carried: list[Any]) -> list[Any]:
-        inner = interpreter.inner()
-        own = _load_all(inner, carried, avals, flags)
-        return _dump_all(inner, inner.run(p["body_jaxpr"], [*inner.enter(consts), *own]), avals, flags)
+        return loop.step(interpreter, carried, flags)
 
-    last = lax.while_loop(test, step, _dump_all(interpreter, carry, avals, flags))
-    return _load_all(interpreter, last, avals, flags)
+    last = lax.while_loop(test, step, _dump_all(interpreter, loop.carry, loop.avals, flags))
+    return _load_all(interpreter, last, loop.avals, flags)
+
+
+def while_by_vehicle(
+    interpreter: Interpreter, equation: Any, values: list[Value], any_of: Callable[[Any], Any]
+) -> list[Value]:
+    """A loop that ends for each vehicle by itself: the others go on, and what it carries stays.
+
+    ``any_of`` tells whether any of the vehicles [N] goes on, by numbers of which those that do have one above zero.
+    """
+    loop = _While.of(equation, values)
+    flags = [True] * len(loop.carry)
+    interpreter.settle([*loop.test_consts, *loop.consts])
+
+    def going(carried: list[Any]) -> Any:
+        return lax.convert_element_type(loop.going(interpreter, carried, flags, True), jnp.int32)
+
+    def step(state: tuple[Any, list[Any]]) -> tuple[Any, list[Any]]:
+        on, carried = state
+        after = loop.step(interpreter, carried, flags)
+        kept = [lax.select(on > 0, new, old) for new, old in zip(after, carried, strict=True)]
+        return on * going(kept), kept
+
+    first = _dump_all(interpreter, loop.carry, loop.avals, flags)
+    _, last = lax.while_loop(lambda state: any_of(state[0]), step, (going(first), first))
+    return _load_all(interpreter, last, loop.avals, flags)
 
 
 def _cond(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[Value]:

@@ -17,12 +17,12 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from swarmsim.scalars.access import Memory, MemoryGraph, Numbers, Rows, apart
-from swarmsim.scalars.control import CONTROL, loop_counts
+from swarmsim.scalars.control import CONTROL, loop_counts, while_by_vehicle
 from swarmsim.scalars.graph import Graph, Scalar, is_constant, varying_axes
 from swarmsim.scalars.indexing import full_start, gather_plan
 from swarmsim.scalars.interpreter import SMALL, Interpreter, Value, Whole, is_number, is_small, needed
 from swarmsim.scalars.program import Program
-from swarmsim.scalars.rules import ADD, ELEMENTWISE, GE, LE, MAX, MIN, MUL, pack
+from swarmsim.scalars.rules import ADD, ELEMENTWISE, GE, LE, MAX, MIN, MUL, NotWritableError, pack
 
 _NOT_IN_TRITON = frozenset({"erf", "erfc", "lgamma", "digamma", "bessel_i0e", "bessel_i1e", "round"})
 _TYPES = {"bool", "int32", "uint32", "float32"}
@@ -105,6 +105,14 @@ def _scan(interpreter: _InKernel, equation: Any, values: list[Value]) -> Sequenc
     if any(isinstance(x, Whole) for x in values[first_row:]) or (columns and p["length"] > interpreter.unroll):
         raise NotInKernelError("a loop over the rows of an array")
     return CONTROL["scan"](interpreter, equation, values)
+
+
+def _while(interpreter: _InKernel, equation: Any, values: list[Value]) -> Sequence[Value]:
+    """A loop whose end each thread has of its own: a block goes on until the last of its threads is through."""
+    try:
+        return CONTROL["while"](interpreter, equation, values)
+    except NotWritableError:
+        return while_by_vehicle(interpreter, equation, values, lambda going: jnp.max(going) > 0)
 
 
 def _flat(strides: Sequence[int], index: Sequence[int]) -> int:
@@ -264,7 +272,7 @@ def _launch(
         memory = Memory(size, vehicle)
         graph = MemoryGraph(block, memory=memory)
         (nothing,) = graph.values([graph.read(refs[0], Rows(False, False, 1), np.int32(0), 0)])
-        interpreter = _InKernel(graph, {**CONTROL, "scan": _scan}, program.unroll, nothing)
+        interpreter = _InKernel(graph, {**CONTROL, "scan": _scan, "while": _while}, program.unroll, nothing)
         results = _evaluated(program, operands, iter(refs[1 : 1 + len(given)]), interpreter)
         _store(place, total, list(zip(refs[1 + len(given) :], results, strict=True)))
 

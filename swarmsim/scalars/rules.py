@@ -280,6 +280,12 @@ def _dot_general(graph: Graph, equation: Any, a: np.ndarray, b: np.ndarray) -> n
     return pack(products, out.shape, out.dtype)
 
 
+def _bitcast(graph: Graph, equation: Any, x: np.ndarray) -> np.ndarray:
+    if equation.invars[0].aval.dtype.itemsize != equation.outvars[0].aval.dtype.itemsize:
+        raise NotWritableError  # of one entry become several, or of several one
+    return elementwise(graph, equation, x)
+
+
 def _sort(graph: Graph, equation: Any, *operands: np.ndarray) -> list[np.ndarray]:
     if operands[0].shape[equation.params["dimension"]] > 1:
         raise NotWritableError
@@ -307,6 +313,7 @@ RULES: dict[str, Rule] = {
     "argmax": _arg_extreme(GT),
     "argmin": _arg_extreme(LT),
     "dot_general": _dot_general,
+    "bitcast_convert_type": _bitcast,
     "sort": _sort,
     "iota": _iota,
     "empty": lambda graph, equation: np.zeros(equation.outvars[0].aval.shape, equation.outvars[0].aval.dtype),

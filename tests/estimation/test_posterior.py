@@ -183,6 +183,32 @@ def test_a_source_beside_a_straight_way_may_lie_on_either_side_of_it(seed):
     assert float(jnp.sqrt(found.covariance[0, 0])) < 0.2
 
 
+@pytest.mark.parametrize("none", [-np.inf, np.nan])
+def test_a_posterior_of_which_no_place_was_found_is_worth_nothing(none):
+    """It is sought about the start all the time, and no place counts as one of the posterior."""
+    start = jnp.array([50.0, 60.0, 1.0])
+
+    def weigh(x):
+        return Weighed(place=x, log_activity=x[0], variance=jnp.float32(0.01), log_posterior=jnp.float32(none))
+
+    found = jax.jit(lambda: sample_posterior(weigh, start, jnp.eye(3), 6, 40))()
+    assert float(found.effective) == 0.0
+    np.testing.assert_allclose(found.mean[:3], start, atol=0.5)
+
+
+def test_a_place_without_weight_may_have_any_values():
+    def weigh(x):
+        there = x[0] > 0.3
+        return Weighed(
+            place=x, log_activity=jnp.where(there, x[0], jnp.nan), variance=jnp.where(there, 0.01, jnp.inf),
+            log_posterior=jnp.where(there, -0.5 * jnp.sum(x * x), -jnp.inf),
+        )  # fmt: skip
+
+    found = jax.jit(lambda: sample_posterior(weigh, jnp.zeros(3), jnp.eye(3), 6, 40))()
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(found))
+    assert float(found.mean[0]) == pytest.approx(1.0, abs=0.15)  # of the half of a normal beyond 0.3: 0.998
+
+
 def test_without_any_measurement_the_moments_are_finite():
     problem, state = told([], 0)
     m = problem.measurements

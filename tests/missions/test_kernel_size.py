@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import pytest
 from jax.extend import core
 
 import swarmsim
 from swarmsim.missions.begin import begin_mission
 from swarmsim.missions.frame import frame
+from swarmsim.site.rays import crossed_from
 
 # Triton's CoalescePass took 200 s of one core for kernels of 1.2e10 (an older layout of the UAVs of `recon`, in which
 # accesses stood among all else): the limit stands for half a minute.
@@ -42,8 +44,8 @@ def set_apart(equation):
     """Whether what is outside a loop is out of Triton's sight: it is in that of one that counts (`access.apart`)."""
     if equation.primitive.name != "while":
         return False
-    (test,) = equation.params["cond_jaxpr"].jaxpr.eqns
-    return any(isinstance(v, core.Literal) and v.val == 2 for v in test.invars)
+    test, *more = equation.params["cond_jaxpr"].jaxpr.eqns
+    return not more and any(isinstance(v, core.Literal) and v.val == 2 for v in test.invars)
 
 
 def cost_of(jaxpr, seen):
@@ -67,6 +69,32 @@ def test_kernels_of_a_mission_are_compiled_in_seconds(name, monkeypatch):
     assert len(kernels) >= 2  # of each group what it sees, and how it moves
     costs = [cost_of(kernel, size_of(kernel)) for kernel in kernels]
     assert all(0 < cost < COST_MAX for cost in costs)
+
+
+@pytest.mark.parametrize("name", ["recon", "mixed"])
+def test_what_rays_to_a_source_cross_is_one_kernel(name, monkeypatch):
+    """Of a site that is an argument, as in the estimate: no loop over boxes or tiles of the terrain is left to XLA."""
+    site = swarmsim.build(swarmsim.load(name)).site_model.site
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    starts, ends = jnp.zeros((2, 5, 3)), jnp.zeros((40, 3))
+
+    def every(site, starts):
+        return jax.vmap(jax.vmap(lambda a: crossed_from(site, a, ends)))(starts)
+
+    traced = jax.make_jaxpr(every)(site, starts).jaxpr
+    (kernel,) = kernels_of(traced)
+    assert loops_outside(traced) == 0
+    assert 0 < cost_of(kernel, size_of(kernel)) < COST_MAX
+
+
+def loops_outside(jaxpr):
+    """Loops that no kernel contains."""
+    found = 0
+    for equation in jaxpr.eqns:
+        if equation.primitive.name != "pallas_call":
+            found += equation.primitive.name in ("while", "scan")
+            found += sum(map(loops_outside, jaxprs_in(equation)))
+    return found
 
 
 def test_accesses_among_all_else_would_be_noticed():

@@ -198,6 +198,27 @@ def test_settings_of_jax_and_xla_tell_programs_apart(monkeypatch: pytest.MonkeyP
     assert key() != plain
 
 
+@pytest.mark.parametrize(
+    ("processor", "chosen", "products"), [(False, None, 1), (True, None, 0), (False, "bfloat16", 0)]
+)
+def test_an_accelerator_multiplies_float32_as_such(
+    processor: bool, chosen: str | None, products: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless the user has set another precision; nothing of it stays behind."""
+    monkeypatch.setattr(programs, "on_processor", lambda: processor)
+    lowered, made = [], programs._machine_code
+
+    def machine_code(program: Any) -> Any:
+        lowered.append(program.as_text())
+        return made(program)
+
+    monkeypatch.setattr(programs, "_machine_code", machine_code)
+    with jax.default_matmul_precision(chosen):
+        Program("square", lambda x: x @ x, clock=Clock())(jnp.ones((3, 3)))
+    assert lowered[0].count("HIGHEST") == 2 * products  # of either factor
+    assert jax.config.values["jax_default_matmul_precision"] is None
+
+
 def test_donated_buffers_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     for _ in range(2):  # compiled, then loaded

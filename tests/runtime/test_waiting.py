@@ -1,5 +1,6 @@
 """Another thread computes what is waited for, the same one each time unless it is interrupted."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import time
 
 import pytest
 
+from swarmsim.runtime import waiting
 from swarmsim.runtime.waiting import waited_for
 
 
@@ -50,6 +52,40 @@ def test_a_thread_that_ends_leaves_no_other_behind():
             return
         time.sleep(0.05)
     pytest.fail("the thread that computed for it goes on")
+
+
+LATE = """
+import atexit
+from swarmsim.runtime.waiting import waited_for
+
+atexit.register(lambda: print(waited_for(lambda: 7)))  # called after whatever the first call has registered
+waited_for(lambda: 1)
+"""
+
+
+def test_what_is_called_while_the_interpreter_ends_may_wait():
+    done = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.split() == ["7"]
+
+
+def test_ctrl_c_while_the_thread_begins_leaves_none_behind(monkeypatch):
+    started = threading.Thread.start
+
+    def interrupted(thread: threading.Thread) -> None:
+        started(thread)
+        raise KeyboardInterrupt
+
+    before = set(threading.enumerate())
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            waiting._Waiter()
+    for _ in range(200):
+        gc.collect()
+        if set(threading.enumerate()) <= before:
+            return
+        time.sleep(0.05)
+    pytest.fail("a thread that nobody knows of goes on")
 
 
 FORKS = """

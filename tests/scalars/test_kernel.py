@@ -51,6 +51,57 @@ def test_loops_and_branches_run_inside(function):
     assert_alike(jax.jit(mapped)(x3), jax.vmap(function)(x3))
 
 
+def halved(x):
+    """A loop that ends for each vehicle by itself, at once for some; and one within it."""
+
+    def step(carry):
+        value, number = carry
+        part = lax.while_loop(lambda v: jnp.abs(v[1]) > 0.2, lambda v: 0.7 * v, value)
+        return jnp.array([0.5 * value[0], value[1], part[1]]), number + 1
+
+    return lax.while_loop(lambda carry: carry[0][0] > 0.1, step, (x, jnp.int32(0)))
+
+
+def counted(x):
+    """A loop of so many passes for each vehicle, which carries what is alike for all."""
+    last = jnp.int32(10.0 * jnp.abs(x[0]))
+    return lax.while_loop(lambda c: c[0] < last, lambda c: (c[0] + 1, 2.0 * c[1]), (jnp.int32(0), jnp.float32(1.0)))
+
+
+@pytest.mark.parametrize("function", [halved, counted])
+@pytest.mark.parametrize("times", [1, 30], ids=["a block", "blocks"])
+def test_loops_end_for_each_vehicle_by_itself(function, times):
+    mapped, many = in_kernel(function), jnp.abs(jnp.tile(x3, (times, 1))) * jnp.linspace(0.1, 3.0, times * N)[:, None]
+    assert kernels_in(mapped, many) == 1
+    found = jax.jit(mapped)(many)
+    assert_alike(found, jax.vmap(function)(many))
+    passes = found[1] if function is halved else found[0]
+    assert len(set(passes.tolist())) > 2
+    assert_alike(jax.jit(jax.vmap(mapped))(MISSIONS), jax.vmap(jax.vmap(function))(MISSIONS))
+
+
+def test_a_loop_ends_though_what_it_no_longer_needs_is_no_number():
+    """The body is evaluated for vehicles that are through: what comes out of it must not reach them."""
+
+    def root(x):
+        return lax.while_loop(lambda v: v > 1.0, lambda v: jnp.sqrt(v - 1.0), x)
+
+    values = jnp.array([0.5, 1.5, 100.0, -3.0])
+    assert_alike(jax.jit(in_kernel(root))(values), jax.vmap(root)(values))
+
+
+def keyed(x):
+    """A number and an index in one, by their bits."""
+    bits = lax.bitcast_convert_type(jnp.abs(x), jnp.int32)
+    return lax.bitcast_convert_type((bits & ~0xFF) | 7, jnp.float32), bits
+
+
+def test_bits_of_numbers_are_seen_inside():
+    assert kernels_in(in_kernel(keyed), x3) == 1
+    for found in (jax.jit(in_kernel(keyed))(x3), jax.jit(over_vehicles(keyed))(x3)):
+        assert_alike(found, jax.vmap(keyed)(x3), rtol=0.0, atol=0.0)
+
+
 def test_reads_from_long_arrays_of_vehicles_and_of_all():
     axes = (0, 0, None, None)
     shared = numbers(3, seed=4)[0]
@@ -113,7 +164,6 @@ def test_a_vehicle_with_its_controller_is_one_kernel():
         lambda x: x + jax.random.normal(jax.random.key(0), (3,)),
         lambda x: jnp.sort(jnp.tile(x, 40))[:3],
         lambda x: jnp.tile(x, 40),  # a result that is not taken apart
-        lambda x: lax.while_loop(lambda v: v[0] > 0.1, lambda v: 0.5 * v, x),  # an end of its own for each vehicle
         lambda x: jax.scipy.special.gammaln(jnp.abs(x) + 1.0),
         lambda x: (x.astype(jnp.float16) * jnp.float16(2.0)).astype(jnp.float32),
         lambda x: lax.scan(lambda c, row: (c + row, c), x[0], jnp.tile(x, 10))[0],

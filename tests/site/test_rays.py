@@ -193,7 +193,12 @@ def test_a_thread_for_each_segment_crosses_the_same():
     starts = jnp.asarray(np.c_[rng.uniform(-12.0, 12.0, (3, 2)), rng.uniform(0.3, 2.0, 3)], jnp.float32)
     ends = jnp.asarray(np.c_[rng.uniform(-12.0, 12.0, (40, 2)), rng.uniform(0.3, 15.0, 40)], jnp.float32)
     expected = jax.jit(jax.vmap(lambda a: crossed_from(site, a, ends)))(starts)
-    found = jax.jit(jax.vmap(lambda a: by_threads(site, a, ends, "gpu, interpreted")))(starts)
+
+    def all_threads(site, starts):
+        return jax.vmap(lambda a: by_threads(site, a, ends, "gpu, interpreted"))(starts)
+
+    assert str(jax.make_jaxpr(all_threads)(site, starts)).count("pallas_call[") == 1
+    found = jax.jit(all_threads)(site, starts)
     np.testing.assert_allclose(found.length_m, expected.length_m, atol=1e-4)
     np.testing.assert_allclose(found.place, expected.place, atol=1e-4)
     one_by_one = jax.jit(jax.vmap(lambda a: jax.vmap(lambda b: crossed(site, a, b))(ends)))(starts)
