@@ -4,12 +4,14 @@ import os
 import threading
 import weakref
 from collections.abc import Callable
-from concurrent.futures import Future
-from queue import SimpleQueue
+from contextlib import suppress
+from queue import Empty, SimpleQueue
 from threading import Thread
-from typing import TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+LOOKS_AGAIN_S = 0.5
 
 _waiters = threading.local()  # the one of each thread that is idle
 if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's threads
@@ -18,22 +20,33 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
 
 def waited_for(long: Callable[[], T]) -> T:
     """The value of ``long``, which another thread computes: Ctrl-C interrupts waiting, but not XLA itself."""
-    future: Future[T] = Future()
+    answers: SimpleQueue[tuple[bool, Any]] = SimpleQueue()
 
     def compute() -> None:
         try:
-            future.set_result(long())
+            answers.put((True, long()))
         except BaseException as error:  # goes to the thread that waits
-            future.set_exception(error)
+            answers.put((False, error))
 
     waiter: _Waiter = getattr(_waiters, "idle", None) or _Waiter()
     _waiters.idle = None  # one that goes on computing after Ctrl-C is left behind
     waiter.work.put(compute)
+    sound, answer = _awaited(answers)
+    _waiters.idle = waiter
     try:
-        return future.result()
+        if sound:
+            value: T = answer
+            return value
+        raise answer
     finally:
-        if future.done():
-            _waiters.idle = waiter
+        del answer  # an error refers to this call, which would keep it
+
+
+def _awaited(answers: "SimpleQueue[T]") -> T:
+    """The first of them. A signal that comes just before the thread begins to wait does not wake it: it looks again."""
+    while True:
+        with suppress(Empty):
+            return answers.get(timeout=LOOKS_AGAIN_S)
 
 
 class _Waiter:
