@@ -100,6 +100,7 @@ def _check_fence(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     surveys = [(i, own) for i, own in enumerate(scenario.settings) if isinstance(own, ParallelLines)]
     if fence.action == "none" or not surveys:
         return
+    import jax
     import jax.numpy as jnp
 
     from swarmsim.policies.coverage import lines_needed, survey_lines
@@ -112,7 +113,8 @@ def _check_fence(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
         if not all(ground.holds(corner) for corner in area):  # told of already
             continue
         lines = lines_needed(area, spacing, sweep)
-        start, end, used = survey_lines(jnp.asarray(area), jnp.float32(sweep), jnp.float32(spacing), lines)
+        cut = jax.jit(survey_lines, static_argnums=3)  # one by one its operations take a second to compile
+        start, end, used = cut(jnp.asarray(area), jnp.float32(sweep), jnp.float32(spacing), lines)
         first, last = np.asarray(start, float)[np.asarray(used)], np.asarray(end, float)[np.asarray(used)]
         stop = float(stopping_m(jnp.float32(own.speed_m_s), brake))
         onward = stop * np.array([math.cos(sweep), math.sin(sweep)])

@@ -66,11 +66,9 @@ class Ground:
 
     def clearances(self, xy: Floats) -> Floats:
         """Clearance [p] at points [p, 2], bilinear as the bumpers have it."""
-        import jax.numpy as jnp
+        from swarmsim.site.model import sampled
 
-        from swarmsim.site import sample
-
-        return np.asarray(sample(self.site.clearance_m, self.site, jnp.asarray(xy, jnp.float32)), float)
+        return sampled(self.site.clearance_m, self.site, xy)
 
     def least_clearance(self, xy: Floats) -> float:
         """Least clearance of a rover at points [p, 2]."""

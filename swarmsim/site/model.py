@@ -88,7 +88,7 @@ def walls_among(densities_kg_m3: Sequence[float]) -> NDArray[np.float64]:
     return np.where(densities < SURROUNDING_KG_M3, 0.0, densities)
 
 
-def _cells_of(site: Site, raster: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _cells_of(site: Site, raster: Any) -> tuple[jax.Array, jax.Array]:
     """Centre [2] of the south-west cell of a raster and its cell's edge length [] (m): the site's, or finer cells."""
     factor = max(1, raster.shape[0] // site.terrain_m.shape[0])
     if factor == 1:
@@ -154,12 +154,18 @@ def bounds_m(site: Site) -> tuple[jax.Array, jax.Array]:
 
 
 def height_at(site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Height of the terrain [n] at ``xy`` [n, 2] (ENU, m), bilinear as `sample`, on the host."""
-    terrain = np.asarray(site.terrain_m, np.float64)
-    ny, nx = terrain.shape
-    place = np.clip((xy - np.asarray(site.origin_m)) / float(site.cell_m), 0.0, [nx - 1, ny - 1])
+    """Height of the terrain [n] at ``xy`` [n, 2] (ENU, m) on the host; see `sampled`."""
+    return sampled(site.terrain_m, site, xy)
+
+
+def sampled(raster: Any, site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+    """`sample` of a raster at ``xy`` [n, 2] (ENU, m) on the host, where nothing has to be compiled for it; [n]."""
+    values = np.asarray(raster)
+    ny, nx = values.shape
+    origin, cell = _cells_of(site, values)
+    place = np.clip((xy - np.asarray(origin)) / float(cell), 0.0, [nx - 1, ny - 1])
     index = np.minimum(place.astype(int), [nx - 2, ny - 2])
     (x, y), column, row = (place - index).T, index[:, 0], index[:, 1]
-    south = terrain[row, column] + x * (terrain[row, column + 1] - terrain[row, column])
-    north = terrain[row + 1, column] + x * (terrain[row + 1, column + 1] - terrain[row + 1, column])
-    return south + y * (north - south)
+    near = [values[row + i, column + k].astype(np.float64) for i in (0, 1) for k in (0, 1)]
+    south, north = near[0] + x * (near[1] - near[0]), near[2] + x * (near[3] - near[2])
+    return np.asarray(south + y * (north - south))

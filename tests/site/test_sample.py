@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from yards import make_site
 
 from swarmsim.site import sample, sample_with_gradient
+from swarmsim.site.model import sampled
 
 RASTER = np.random.default_rng(1).normal(size=(7, 9)).astype(np.float32)
 SITE = make_site(terrain=RASTER, cell=0.5, origin=(2.0, -1.0))
@@ -29,6 +30,16 @@ def test_bilinear_formula(x, y):
     expected = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
     value, _ = sample_with_gradient(SITE.terrain_m, SITE, jnp.array([x, y]))
     assert float(value) == pytest.approx(float(expected), abs=1e-4)
+
+
+@pytest.mark.parametrize("finer", [1, 3])
+def test_the_host_reads_the_same(finer):
+    raster = np.kron(RASTER, np.ones((finer, finer), np.float32)) + np.linspace(0.0, 1.0, 9 * finer, dtype=np.float32)
+    xy = np.random.default_rng(3).uniform([0.0, -3.0], [9.0, 4.0], (200, 2))  # some beyond the border
+    expected = jax.jit(lambda p: sample(jnp.asarray(raster), SITE, p))(jnp.asarray(xy, jnp.float32))
+    found = sampled(raster, SITE, xy)
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("xy", [(3.1, 0.3), (2.2, -0.9), (5.9, 1.9), (1.0, 0.3), (9.0, 5.0)])
