@@ -3,7 +3,6 @@
 Sources and versions, devices and processor, settings of JAX and XLA.
 """
 
-import hashlib
 import importlib.metadata
 import os
 import platform
@@ -13,6 +12,8 @@ from pathlib import Path
 
 import jax
 
+from swarmsim.store import package_digest
+
 # Packages whose version decides how a function is traced or compiled.
 _PACKAGES = (
     "jax", "jaxlib", "jax-cuda12-plugin", "jax-cuda13-plugin", "mujoco", "mujoco-mjx", "numpy", "scipy", "optax"
@@ -21,16 +22,6 @@ _PACKAGES = (
 _INDIFFERENT = re.compile(
     "cache|log|dump|traceback|pprint|tracer_error|transfer|timeout|thread_guard|garbage|platform|explain|proxy"
 )
-
-
-@lru_cache
-def package_digest() -> str:
-    """The digest of the sources of swarmsim: the version of all its programs."""
-    root = Path(__file__).parents[1]
-    digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        digest.update(f"{path.relative_to(root).as_posix()}\n{path.stat().st_size}\n".encode() + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 def settings() -> str:

@@ -11,8 +11,7 @@ import jax
 import jax.monitoring
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
-from swarmsim.runtime.environment import package_digest
-from swarmsim.runtime.store import read_entry, write_entry
+from swarmsim.store import package_digest, read_entry, write_entry
 
 
 class UnstorableError(ValueError):

@@ -1,7 +1,7 @@
 """Functions compiled once: for the process, and for every later process of this user on this kind of machine.
 
 A program is found by a digest of what decides its machine code, computed without tracing (see `Program`). Its
-executable is looked up in this process, then in the user's cache folder (see `swarmsim.runtime.store`); only then is
+executable is looked up in this process, then in the user's cache folder (see `swarmsim.store`); only then is
 the function traced and compiled. JAX's own compilation cache is not needed and not touched.
 """
 

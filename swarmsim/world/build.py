@@ -15,7 +15,7 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.flight import Failsafe
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
-from swarmsim.kept import kept
+from swarmsim.kept import kept, stored
 from swarmsim.physics.multirotor import check_time_step
 from swarmsim.pytree import on_host
 from swarmsim.radiation.background import SMOOTH_M, BackgroundField
@@ -313,7 +313,7 @@ def _detector(scenario: Scenario, model: str, library: Library) -> Detector:
     return _kept_detector(scenario.detectors[model], mount, library, scenario.mission.detection)
 
 
-_kept_detector = kept(8)(build_detector)
+_kept_detector = kept(8)(stored(reads=("elements",))(build_detector))
 """Its tables take a second: missions of a family share them."""
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from swarmsim.runtime import store
+from swarmsim import store
 
 VERSION, KEY, CONTENT = "0123", "abcd", os.urandom(1000)
 

@@ -1,7 +1,8 @@
-"""The user's folder of compiled programs: entries written whole, read with a checksum, bounded in size.
+"""The user's folder of compiled programs, and of tables that take long to compute.
 
-Entries are unpickled, so they are read from a folder that only the user can write. Whatever cannot be read or written
-is treated as absent: the program is then compiled, with the same result.
+Entries are written whole, read with a checksum, bounded in size. They are unpickled, so they are read from a folder
+that only the user can write. Whatever cannot be read or written is treated as absent: the program is then compiled, or
+the table computed, with the same result.
 """
 
 import contextlib
@@ -11,6 +12,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import platformdirs
@@ -20,6 +22,16 @@ MAX_AGE_S = 30 * 86400.0  # of entries of other versions of swarmsim
 _SUFFIX = ".program"
 _MAGIC = b"swarmsim program 1\n"
 _CHECKSUM_BYTES = hashlib.sha256().digest_size
+
+
+@lru_cache
+def package_digest() -> str:
+    """The digest of the sources of swarmsim: the version of all that is stored."""
+    root = Path(__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(f"{path.relative_to(root).as_posix()}\n{path.stat().st_size}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 def program_folder() -> Path | None:
