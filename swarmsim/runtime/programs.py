@@ -27,7 +27,12 @@ from swarmsim.runtime.fingerprint import UnidentifiableError, fingerprint, shard
 from swarmsim.runtime.waiting import waited_for
 
 # Settings that may change between two calls of a program; the others are set once, before JAX starts.
-_CHANGEABLE = ("jax_enable_x64", "jax_default_matmul_precision", "jax_debug_nans", "jax_default_device")
+_CHANGEABLE: dict[str, Callable[[Any], contextlib.AbstractContextManager[Any]]] = {
+    "jax_enable_x64": jax.enable_x64,
+    "jax_default_matmul_precision": jax.default_matmul_precision,
+    "jax_debug_nans": jax.debug_nans,
+    "jax_default_device": jax.default_device,
+}
 
 _PATIENCE = (
     "xla_cpu_collective_call_warn_stuck_seconds",
@@ -110,7 +115,14 @@ class Program:
         arguments = jax.tree.map(_described, tuple(arguments))  # a call may take the arrays over meanwhile
         situation = _situation(*jax.tree.flatten(arguments))
         if situation not in self._executables and situation not in self._coming:
-            self._coming[situation] = threads.submit(self._obtain, arguments)
+            self._coming[situation] = threads.submit(self._obtain_with, _changeable(), arguments)
+
+    def _obtain_with(self, settings: Sequence[Any], arguments: Sequence[Any]) -> tuple[_Ready, Source]:
+        """`_obtain` with the settings of the thread that asked for it: those of a context are that thread's alone."""
+        with contextlib.ExitStack() as stack:
+            for manager, value in zip(_CHANGEABLE.values(), settings, strict=True):
+                stack.enter_context(manager(value))
+            return self._obtain(arguments)
 
     def _obtain(self, arguments: Sequence[Any]) -> tuple[_Ready, Source]:
         """The executable for these arguments, and how it was obtained."""
@@ -245,7 +257,7 @@ def _warn_not_kept(name: str, reason: Exception) -> None:
     warnings.warn(f"program {name!r} is compiled anew in every process: {reason}", stacklevel=2)
 
 
-def _changeable() -> Hashable:
+def _changeable() -> tuple[Any, ...]:
     return tuple(getattr(jax.config, name) for name in _CHANGEABLE)
 
 

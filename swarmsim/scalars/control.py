@@ -171,6 +171,8 @@ class _While:
     @classmethod
     def of(cls, equation: Any, values: list[Value]) -> "_While":
         p = equation.params
+        if p["cond_jaxpr"].jaxpr.outvars[0].aval.shape:
+            raise NotWritableError  # several loops in step, as `jax.vmap` makes them
         first, split = p["cond_nconsts"], p["cond_nconsts"] + p["body_nconsts"]
         return cls(p["cond_jaxpr"], p["body_jaxpr"], values[:first], values[first:split], values[split:])
 

@@ -24,7 +24,10 @@ from swarmsim.scalars.interpreter import SMALL, Interpreter, Value, Whole, is_nu
 from swarmsim.scalars.program import Program
 from swarmsim.scalars.rules import ADD, ELEMENTWISE, GE, LE, MAX, MIN, MUL, NotWritableError, pack
 
-_NOT_IN_TRITON = frozenset({"erf", "erfc", "lgamma", "digamma", "bessel_i0e", "bessel_i1e", "round"})
+_NOT_IN_TRITON = frozenset({
+    "erf", "erfc", "lgamma", "digamma", "bessel_i0e", "bessel_i1e", "round", "reduce_precision"
+})  # fmt: skip
+_NOT_OF_BOOLEANS = frozenset({"max", "min", "reduce_max", "reduce_min", "cummax", "cummin"})
 _TYPES = {"bool", "int32", "uint32", "float32"}
 _BLOCKS = ((2**17, 128), (2**14, 64), (0, 32))  # threads of a block from so many vehicles on: few fill few processors
 _WARP = 32
@@ -63,8 +66,11 @@ class _InKernel(Interpreter):
         if not known and name in ELEMENTWISE:
             types = {str(v.aval.dtype) for v in (*equation.invars, *equation.outvars)}
             powers = name in ("pow", "integer_pow") and "float32" not in types
-            if name in _NOT_IN_TRITON or powers or not types <= _TYPES or (name == "select_n" and len(values) > 3):
+            chooses = name == "select_n" and len(values) > 3
+            if name in _NOT_IN_TRITON or powers or chooses or not types <= _TYPES:
                 raise NotInKernelError(f"{name} of {', '.join(sorted(types))}")
+        if not known and name in _NOT_OF_BOOLEANS and equation.invars[0].aval.dtype == bool:
+            raise NotInKernelError(f"{name} of bool")
         if name == "stop_gradient":  # a kernel is not differentiated
             return values
         if name in ("custom_jvp_call", "custom_vjp_call"):
@@ -76,6 +82,23 @@ class _InKernel(Interpreter):
         if isinstance(value, Whole) or aval.shape:
             raise NotInKernelError("an array that is not taken apart")
         return super().put_together(value, aval)
+
+    def dump(self, value: Value, aval: Any, mapped: bool) -> list[Any]:
+        """Scalars of a value; a view cannot be carried, nor what is no array in memory."""
+        if isinstance(value, Whole):
+            raise NotInKernelError("a loop or a branch that carries an array")
+        return super().dump(value, aval, mapped)
+
+    def settle(self, values: Sequence[Value]) -> None:
+        """Bind the scalars of values, and the offsets of views."""
+        self.graph.values(x.array.offset for x in values if isinstance(x, Whole) and isinstance(x.array, _View))
+        super().settle(values)
+
+    def _entered(self, value: Value) -> Value:
+        view = value.array if isinstance(value, Whole) else None
+        if not isinstance(view, _View) or is_constant(view.offset):
+            return super()._entered(value)
+        return Whole(replace(view, offset=self.graph.leaf(view.offset.value, view.offset.mapped)), value.mapped)
 
     def vmapped(self, equation: Any, values: list[Value]) -> list[Value]:
         """Outputs of an equation that has no form in scalars: reads from memory."""
@@ -89,7 +112,7 @@ class _InKernel(Interpreter):
     def of_view(self, view: _View, mapped: bool, aval: Any) -> Value:
         """A view as a value: its entries, if there are few."""
         if not is_small(aval, SMALL):
-            return Whole(view, mapped)
+            return Whole(view, mapped or (not is_constant(view.offset) and view.offset.mapped))
         places = [_flat(view.strides, index) for index in np.ndindex(*view.shape)]
         return pack(self.entries(view, view.offset, places), aval.shape, aval.dtype)
 

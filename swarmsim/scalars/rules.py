@@ -281,7 +281,7 @@ def _dot_general(graph: Graph, equation: Any, a: np.ndarray, b: np.ndarray) -> n
 
 
 def _bitcast(graph: Graph, equation: Any, x: np.ndarray) -> np.ndarray:
-    if equation.invars[0].aval.dtype.itemsize != equation.outvars[0].aval.dtype.itemsize:
+    if equation.invars[0].aval.shape != equation.outvars[0].aval.shape:
         raise NotWritableError  # of one entry become several, or of several one
     return elementwise(graph, equation, x)
 

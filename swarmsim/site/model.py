@@ -162,8 +162,11 @@ def sampled(raster: Any, site: Site, xy: NDArray[np.floating]) -> NDArray[np.flo
     """`sample` of a raster at ``xy`` [n, 2] (ENU, m) on the host, where nothing has to be compiled for it; [n]."""
     values = np.asarray(raster)
     ny, nx = values.shape
-    origin, cell = _cells_of(site, values)
-    place = np.clip((xy - np.asarray(origin)) / float(cell), 0.0, [nx - 1, ny - 1])
+    factor = max(1, ny // site.terrain_m.shape[0])
+    coarse = float(site.cell_m)
+    cell = coarse / factor
+    origin = np.asarray(site.origin_m) - 0.5 * (coarse - cell)
+    place = np.clip((xy - origin) / cell, 0.0, [nx - 1, ny - 1])
     index = np.minimum(place.astype(int), [nx - 2, ny - 2])
     (x, y), column, row = (place - index).T, index[:, 0], index[:, 1]
     near = [values[row + i, column + k].astype(np.float64) for i in (0, 1) for k in (0, 1)]

@@ -81,10 +81,12 @@ def test_what_rays_to_a_source_cross_is_one_kernel(name, monkeypatch):
     def every(site, starts):
         return jax.vmap(jax.vmap(lambda a: crossed_from(site, a, ends)))(starts)
 
-    traced = jax.make_jaxpr(every)(site, starts).jaxpr
+    program = jax.jit(every).trace(site, starts)
+    traced = program.jaxpr.jaxpr
     (kernel,) = kernels_of(traced)
     assert loops_outside(traced) == 0
     assert 0 < cost_of(kernel, size_of(kernel)) < COST_MAX
+    assert "triton" in program.lower(lowering_platforms=("cuda",)).as_text()
 
 
 def loops_outside(jaxpr):

@@ -219,6 +219,20 @@ def test_an_accelerator_multiplies_float32_as_such(
     assert jax.config.values["jax_default_matmul_precision"] is None
 
 
+@pytest.mark.parametrize("prepared", [False, True])
+def test_settings_of_a_context_are_those_of_its_programs(prepared: bool) -> None:
+    """Also of what is compiled in the background."""
+    program = Program("tenth", lambda x: x + jnp.asarray(0.1), clock=Clock())
+    with jax.enable_x64(True):
+        x = jnp.ones(3)
+        assert x.dtype == jnp.float64
+        if prepared:
+            prepare([(program, (x,))])
+        found = program(x)
+    assert found.dtype == jnp.float64
+    np.testing.assert_array_equal(found, np.full(3, 1.1))
+
+
 def test_donated_buffers_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     for _ in range(2):  # compiled, then loaded

@@ -90,6 +90,68 @@ def test_a_loop_ends_though_what_it_no_longer_needs_is_no_number():
     assert_alike(jax.jit(in_kernel(root))(values), jax.vmap(root)(values))
 
 
+def in_step(x):
+    """Loops that `jax.vmap` makes one, whose test is an array."""
+    return jax.vmap(lambda y: lax.while_loop(lambda v: v > 0.2, lambda v: 0.6 * v, y))(x)
+
+
+def random_walk(x):
+    """A loop that carries a key, and uses it."""
+
+    def step(carry):
+        key, value = carry
+        return jax.random.split(key)[0], 0.5 * value + jax.random.uniform(key)
+
+    return lax.while_loop(lambda carry: carry[1] < x[0], step, (jax.random.key(3), jnp.float32(0.0)))[1]
+
+
+@pytest.mark.parametrize("function", [in_step, random_walk])
+def test_loops_that_no_kernel_has_are_left_to_xla(function):
+    assert kernels_in(in_kernel(function), x3) == 0
+    for found in (jax.jit(in_kernel(function))(x3), jax.jit(over_vehicles(function))(x3)):
+        assert_alike(found, jax.vmap(function)(x3))
+
+
+def row_of(x, rows):
+    """A row too long to be taken apart, at a place of the vehicle's own: read within loops and a branch, and after."""
+    row = lax.dynamic_index_in_dim(rows, jnp.int32(3.0 * jnp.abs(x[0])), 0, False)
+
+    def inner(i, value):
+        return value + row[i + 2]
+
+    def step(carry):
+        return carry[0] + 1, lax.cond(carry[0] % 2 == 0, lambda: 0.5, lambda: row[5]) * lax.fori_loop(
+            0, 20, inner, carry[1]
+        )
+
+    last = lax.while_loop(lambda c: (c[0] < 4) & (c[1] < 2.0 + row[1]), step, (jnp.int32(0), x[1]))
+    return last, row[0], row[jnp.int32(jnp.abs(x[2]))]
+
+
+def test_parts_of_long_arrays_go_into_loops():
+    rows = jnp.asarray(RASTER.repeat(4, axis=1)[:, :100])
+    mapped = in_kernel(row_of, (0, None))
+    assert kernels_in(mapped, x3, rows) == 1
+    assert_alike(jax.jit(mapped)(x3, rows), jax.vmap(row_of, (0, None))(x3, rows))
+
+
+def of_boolean(x):
+    """What Triton has no reduction of."""
+    return jnp.max(x > 0.0), lax.reduce_precision(x, 8, 10)
+
+
+def test_kernels_are_lowered_for_a_gpu():
+    """As far as Triton's own language: no GPU is needed for that."""
+    rows = jnp.asarray(RASTER.repeat(4, axis=1)[:, :100])
+    on_gpu = partial(over_vehicles, platform="gpu")
+    for function, *others in ((halved,), (counted,), (keyed,), (row_of, rows), (partial(repeated, length=40),)):
+        mapped = on_gpu(function, (0, *(None for _ in others)))
+        assert kernels_in(mapped, x3, *others) == 1
+        lowered = jax.jit(mapped).trace(x3, *others).lower(lowering_platforms=("cuda",)).as_text()
+        assert "triton" in lowered
+    assert kernels_in(on_gpu(of_boolean), x3) == 0
+
+
 def keyed(x):
     """A number and an index in one, by their bits."""
     bits = lax.bitcast_convert_type(jnp.abs(x), jnp.int32)
