@@ -68,7 +68,7 @@ _FIRST = (
 )
 
 _MAPS = 15_000  # the largest files take as many again
-_BYTES = 2.5e9
+_BYTES = 4e9  # that other processes leave: what JAX keeps within those maps is a gigabyte at most
 # Tracing makes millions of objects that live on: collections among them, at the usual 700, took a tenth of the time.
 gc.set_threshold(200_000, 50, 50)
 
@@ -116,11 +116,12 @@ def _return_memory() -> None:
 def _has_room() -> bool:
     """Whether another file's programs find room: in memory, and in the 65,530 maps that Linux allows a process.
 
-    Each program takes some maps.
+    Each program takes some maps. What this process holds of the memory says little: most of it is what the allocator
+    has on its lists.
     """
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        free = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         maps = Path("/proc/self/maps").read_bytes().count(b"\n")
     except OSError:
         return False
-    return maps < _MAPS and pages * os.sysconf("SC_PAGE_SIZE") < _BYTES
+    return maps < _MAPS and 1024 * int(free["MemAvailable"].split()[0]) > _BYTES
