@@ -104,7 +104,7 @@ def for_those(predicate: jax.Array, one: Callable[[], Out], other: Callable[[], 
     """The result of ``one`` where ``predicate`` [] holds, else that of ``other``, which costs next to nothing.
 
     Unlike `either` it is for what takes long and few missions need at a time: an accelerator computes ``one`` for those
-    that need it alone, `AT_A_TIME` together. It is not to be differentiated there.
+    that need it alone, `AT_A_TIME` together. What is computed so cannot be differentiated in reverse.
     """
     if on_processor():
         return jax.lax.cond(predicate, one, other)

@@ -66,9 +66,9 @@ class Ground:
 
     def clearances(self, xy: Floats) -> Floats:
         """Clearance [p] at points [p, 2], bilinear as the bumpers have it."""
-        from swarmsim.site.model import sampled
+        from swarmsim.site.model import sample_on_host
 
-        return sampled(self.site.clearance_m, self.site, xy)
+        return sample_on_host(self.site.clearance_m, self.site, xy)
 
     def least_clearance(self, xy: Floats) -> float:
         """Least clearance of a rover at points [p, 2]."""

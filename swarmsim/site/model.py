@@ -88,9 +88,14 @@ def walls_among(densities_kg_m3: Sequence[float]) -> NDArray[np.float64]:
     return np.where(densities < SURROUNDING_KG_M3, 0.0, densities)
 
 
-def _cells_of(site: Site, raster: Any) -> tuple[jax.Array, jax.Array]:
+def _cells_in_one(site: Site, raster: Any) -> int:
+    """How many cells of a raster lie along the edge of one of the site's."""
+    return max(1, raster.shape[0] // site.terrain_m.shape[0])
+
+
+def _cells_of(site: Site, raster: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Centre [2] of the south-west cell of a raster and its cell's edge length [] (m): the site's, or finer cells."""
-    factor = max(1, raster.shape[0] // site.terrain_m.shape[0])
+    factor = _cells_in_one(site, raster)
     if factor == 1:
         return site.origin_m, site.cell_m
     cell = site.cell_m / factor
@@ -154,17 +159,16 @@ def bounds_m(site: Site) -> tuple[jax.Array, jax.Array]:
 
 
 def height_at(site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Height of the terrain [n] at ``xy`` [n, 2] (ENU, m) on the host; see `sampled`."""
-    return sampled(site.terrain_m, site, xy)
+    """Height of the terrain [n] at ``xy`` [n, 2] (ENU, m) on the host; see `sample_on_host`."""
+    return sample_on_host(site.terrain_m, site, xy)
 
 
-def sampled(raster: Any, site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:
+def sample_on_host(raster: Any, site: Site, xy: NDArray[np.floating]) -> NDArray[np.float64]:
     """`sample` of a raster at ``xy`` [n, 2] (ENU, m) on the host, where nothing has to be compiled for it; [n]."""
     values = np.asarray(raster)
     ny, nx = values.shape
-    factor = max(1, ny // site.terrain_m.shape[0])
     coarse = float(site.cell_m)
-    cell = coarse / factor
+    cell = coarse / _cells_in_one(site, values)
     origin = np.asarray(site.origin_m) - 0.5 * (coarse - cell)
     place = np.clip((xy - origin) / cell, 0.0, [nx - 1, ny - 1])
     index = np.minimum(place.astype(int), [nx - 2, ny - 2])

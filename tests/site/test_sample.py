@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from yards import make_site
 
 from swarmsim.site import sample, sample_with_gradient
-from swarmsim.site.model import sampled
+from swarmsim.site.model import sample_on_host
 
 RASTER = np.random.default_rng(1).normal(size=(7, 9)).astype(np.float32)
 SITE = make_site(terrain=RASTER, cell=0.5, origin=(2.0, -1.0))
@@ -37,7 +37,7 @@ def test_the_host_reads_the_same(finer):
     raster = np.kron(RASTER, np.ones((finer, finer), np.float32)) + np.linspace(0.0, 1.0, 9 * finer, dtype=np.float32)
     xy = np.random.default_rng(3).uniform([0.0, -3.0], [9.0, 4.0], (200, 2))  # some beyond the border
     expected = jax.jit(lambda p: sample(jnp.asarray(raster), SITE, p))(jnp.asarray(xy, jnp.float32))
-    found = sampled(raster, SITE, xy)
+    found = sample_on_host(raster, SITE, xy)
     assert found.dtype == np.float64
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
