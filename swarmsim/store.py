@@ -17,6 +17,8 @@ from pathlib import Path
 
 import platformdirs
 
+from swarmsim.config.files import packaged_dir
+
 MAX_BYTES = 2 * 10**9
 MAX_AGE_S = 30 * 86400.0  # of entries of other versions of swarmsim
 _SUFFIX = ".program"
@@ -26,11 +28,13 @@ _CHECKSUM_BYTES = hashlib.sha256().digest_size
 
 @lru_cache
 def package_digest() -> str:
-    """The digest of the sources of swarmsim: the version of all that is stored."""
-    root = Path(__file__).parent
+    """The digest of swarmsim's sources, and of the tables that programs hold: the version of all that is stored."""
+    root, tables = Path(__file__).parent, packaged_dir() / "elements"
     digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        digest.update(f"{path.relative_to(root).as_posix()}\n{path.stat().st_size}\n".encode() + path.read_bytes())
+    for folder, pattern in ((root, "*.py"), (tables, "*.csv")):
+        for path in sorted(folder.rglob(pattern)):
+            name = f"{path.relative_to(folder).as_posix()}\n{path.stat().st_size}\n"
+            digest.update(name.encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

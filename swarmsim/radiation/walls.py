@@ -1,18 +1,11 @@
 """Photons scattered by walls that are not infinitely wide, or that the line crosses at an angle (device side).
 
 The tables of `swarmsim.radiation.scattering` hold for a slab of infinite width that the line crosses squarely. Of walls
-with the depth t the short way through,
-
-    S(t) P(t / n) exp(k (a g + x (b g + v l) + x^2 (c + w l))),  x = t / (1 + t)
-
-photons arrive, S(t) = t exp(g(t) - t) those of the slab. P is the share of the slab's photons that walls of this size,
-shape and place send to the detector, for n walls in turn (`swarmsim.site.surfaces`), linear in ln(t) between
-`swarmsim.site.surfaces.DEPTHS` and constant beyond. k is 1 where the line leads out of a hollow box: photons go to and
-fro inside it before they leave, the more of them the less the material absorbs (g) and the lower their energy is
-(l, its logarithm over 662 keV). A wide wall that is crossed squarely is the slab: P = 1, k = 0.
-
-The constants (``configs/elements/walls.csv``) are fitted to the Monte Carlo of buildings
-(``experiments/transport/walls.py``).
+with the depth t the short way through, P S(t) photons arrive, S(t) = t exp(g(t) - t) those of the slab. ln P has, for
+the size, the shape and the place of the walls, coefficients at depths of t / n for n walls in turn
+(`swarmsim.site.wall_network`): of 1, of the energy's logarithm, and of the growth g, which tells how much the material
+absorbs. It is linear in ln(t) between those depths and constant beyond. A wide wall that is crossed squarely is the
+slab: ln P = 0.
 """
 
 from typing import NamedTuple
@@ -23,9 +16,12 @@ import numpy as np
 
 from swarmsim.radiation.scattering import DEPTH_MAX, DEPTH_SCALES, POSITIONS
 from swarmsim.site.rays import Crossed
-from swarmsim.site.surfaces import DEPTHS, Constants, constants
+from swarmsim.site.wall_network import COEFFICIENTS, DEPTHS, Array, Network, network
 
 REFERENCE_KEV = 662.0
+HIGHEST = np.log(2.0) + np.array(DEPTHS) - np.log(DEPTHS)
+"""Of ln P at each of `DEPTHS`: with a growth of 0 twice the counts of the bare source would arrive. No case that the
+network was fitted to comes near; it holds for lines like none of those."""
 _LEAST_M = 1e-6
 
 
@@ -47,7 +43,7 @@ def scattered_counts(
     energy_kev: jax.Array,
     surrounds: jax.Array,
     way: Crossed,
-    k: Constants | None = None,
+    net: Network | None = None,
 ) -> Scattered:
     """What arrives of the photons that matter on the way [..., M] scatters.
 
@@ -62,7 +58,7 @@ def scattered_counts(
         energy_kev: [L] of the lines.
         surrounds: [M] 1 for materials that are no walls (air, leaves), else 0.
         way: what the line crosses.
-        k: those of the project's table by default.
+        net: of which the shape comes; the project's by default.
     """
     slant_layers = way.length_m[..., None, :] * attenuation_1_m
     thin_m = way.length_m if way.shape is None else way.shape.thin_m
@@ -91,33 +87,42 @@ def scattered_counts(
         falling = jnp.exp(growth - depth)
         by_depth = falling * (rising + (1.0 - of_walls) * mixed)
         return Scattered(layers, depth, slant_layers, slant, depth * falling, by_depth, falling * mixed)
-    k = k or constants()
-    closed, x = way.shape.closed[..., None], depth / (1.0 + depth)
-    level = jnp.log(jnp.maximum(energy_kev, 1.0) / REFERENCE_KEV)
-    linear, curved = k.growth_depth * growth + k.energy * level, k.depth + k.energy_depth * level
-    more = closed * (k.growth * growth + x * (linear + x * curved))
-    rise_of_more = (k.growth + k.growth_depth * x) * rise + x * (1.0 - x) * (linear + 2.0 * x * curved)
-    share, rise_of_share = _shares(way, depth * of_walls)
-    falling = jnp.exp(growth - depth + of_walls * more)
-    seen = 1.0 + of_walls * (share - 1.0)
+    lines = (net or network()).lines
+    at_walls = depth * of_walls / way.shape.walls[..., None]
+    ln_share, by_ln_depth, by_growth = log_share(way.shape.scattered, at_walls, energy_kev, growth, lines)
+    share, falling = jnp.exp(ln_share), jnp.exp(growth - depth)
+    seen, of_share = 1.0 + of_walls * (share - 1.0), of_walls * share
     # a thicker wall makes up more of the depth
-    mixed *= 1.0 + of_walls * closed * (k.growth + k.growth_depth * x)
-    by_walls = share - 1.0 + rise_of_share + seen * (more + mixed)
-    of_share = of_walls * rise_of_share + (1.0 - of_walls) * by_walls
+    by_walls = share - 1.0 + share * by_ln_depth + (of_share * by_growth + seen) * mixed
+    of_shape = of_share * (by_ln_depth + by_growth * rise) + (1.0 - of_walls) * by_walls
     return Scattered(
         layers, depth, slant_layers, slant, depth * falling * seen,
-        falling * (seen * (rising + of_walls * closed * rise_of_more) + of_share), falling * by_walls,
+        falling * (seen * rising + of_shape), falling * by_walls,
     )  # fmt: skip
 
 
-def _shares(way: Crossed, depth: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """P of walls with depths [..., L], and its derivative by ln(depth)."""
-    assert way.shape is not None
+def log_share(
+    scattered: jax.Array, depth: jax.Array, energy_kev: jax.Array, growth: jax.Array, lines: Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """ln P [..., L] of a wall with ``depth`` [..., L], and its derivatives by ln(depth) and by the growth.
+
+    ``scattered`` [..., OUTPUTS] are the coefficients, ``lines`` the range of `Network`.
+    """
+    lowest, highest, least, most = (jnp.asarray(x) for x in lines)
+    level = jnp.clip(jnp.log(jnp.maximum(energy_kev, 1.0) / REFERENCE_KEV), lowest, highest)
+    of_growth = jnp.clip(growth, least, most) - 1.0
+    within = jnp.where((growth > least) & (growth < most), 1.0, 0.0)
     step = float(np.log(DEPTHS[1] / DEPTHS[0]))
-    at = jnp.log(jnp.maximum(depth / way.shape.walls[..., None], 1e-6) / DEPTHS[0]) / step
-    share = way.shape.share[..., None, :]
-    found, rise = share[..., 0], jnp.zeros_like(at)
+    at = jnp.log(jnp.maximum(depth, 1e-6) / DEPTHS[0]) / step
+    k = scattered[..., None, :]
+    rows = [k[..., n : n + COEFFICIENTS] for n in range(0, k.shape[-1], COEFFICIENTS)]
+    free = [row[..., 0] + row[..., 1] * level + row[..., 2] * of_growth for row in rows]
+    logs = [jnp.minimum(x, float(most)) for x, most in zip(free, HIGHEST, strict=True)]
+    by = [jnp.where(x < most, row[..., 2], 0.0) for row, x, most in zip(rows, free, HIGHEST, strict=True)]
+    found, by_growth, by_depth = logs[0], by[0], jnp.zeros_like(at)
     for number in range(len(DEPTHS) - 1):
-        part, change = jnp.clip(at - number, 0.0, 1.0), share[..., number + 1] - share[..., number]
-        found, rise = found + change * part, rise + jnp.where((part > 0.0) & (part < 1.0), change / step, 0.0)
-    return found, rise
+        part, change = jnp.clip(at - number, 0.0, 1.0), logs[number + 1] - logs[number]
+        found = found + change * part
+        by_growth = by_growth + (by[number + 1] - by[number]) * part
+        by_depth += jnp.where((part > 0.0) & (part < 1.0), change / step, 0.0)
+    return found, by_depth, by_growth * within

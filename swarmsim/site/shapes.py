@@ -1,6 +1,6 @@
 """What decides how walls scatter photons along a segment: its three boxes with the most matter the short way.
 
-`swarmsim.site.rays` finds them; `shaped` computes what they scatter (`swarmsim.site.surfaces`), for those segments
+`swarmsim.site.rays` finds them; `shaped` computes what they scatter (`swarmsim.site.wall_network`), for those segments
 alone that meet any.
 """
 
@@ -12,7 +12,8 @@ import jax.numpy as jnp
 
 from swarmsim.pytree import pytree
 from swarmsim.site.model import Obstacles, Site
-from swarmsim.site.surfaces import DEPTHS, Box, scattered_share
+from swarmsim.site.surfaces import Box
+from swarmsim.site.wall_network import OUTPUTS, scattered
 
 _UPPER = -(1 << 16)  # mask of a number's upper half
 ALIKE = 0.05
@@ -24,7 +25,7 @@ class Shape:
     """What decides how much of the photons that scatter in walls arrives: see `swarmsim.radiation.walls`."""
 
     thin_m: jax.Array  # [..., M] length the shortest way through each piece of matter that is crossed; <= length_m
-    share: jax.Array  # [..., DEPTHS] photons that walls scatter, over those of infinite walls crossed squarely
+    scattered: jax.Array  # [..., OUTPUTS] coefficients of photons over those of infinite walls crossed squarely
     closed: jax.Array  # [...] 0..1: whether the segment leads out of a hollow box
     walls: jax.Array  # [...] 1..2: walls of a box that are crossed in turn
     ground: jax.Array  # [..., 2] how the ground shines, see `mirrored`
@@ -51,7 +52,7 @@ def wide(thin_m: jax.Array, ground: jax.Array) -> Shape:
     one = jnp.ones(thin_m.shape[:-1])
     nothing = jnp.zeros_like(one)
     return Shape(
-        thin_m=thin_m, share=jnp.ones((*one.shape, len(DEPTHS))), closed=nothing, walls=one, ground=ground, low=nothing
+        thin_m=thin_m, scattered=jnp.zeros((*one.shape, OUTPUTS)), closed=nothing, walls=one, ground=ground, low=nothing
     )
 
 
@@ -116,10 +117,10 @@ def shaped(
     keys = jnp.concatenate([way.met.first, way.met.second, way.met.third])
 
     def of(pair: jax.Array) -> jax.Array:
-        """Length the short way, share less 1, closed, and walls less 1 [DEPTHS + 3, k] of pairs [k]."""
+        """Length the short way, coefficients, closed, and walls less 1 [OUTPUTS + 3, k] of pairs [k]."""
         row = pair % n
-        found = scattered_share(_box(boxes, keys[pair], a[row], b[row]))
-        return jnp.stack([found.thin_m, *(x - 1.0 for x in found.share), found.closed, found.walls - 1.0])
+        of_photons, around = scattered(_box(boxes, keys[pair], a[row], b[row]))
+        return jnp.concatenate([around.thin_m[None], of_photons, around.closed[None], around.walls[None] - 1.0])
 
     each = (of(jnp.arange(3 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 3, n)
     matter = jnp.where(keys > 0, each[0].reshape(-1) * of_metre[_row(boxes.material, keys)], 0.0).reshape(3, n)
@@ -130,8 +131,10 @@ def shaped(
     own = matter - left * left / jnp.maximum(matter, 1e-9) + ALIKE * matter
     weight = own * way.boxes / (jnp.maximum(jnp.sum(own, axis=0), 1e-9) * jnp.maximum(way.walls, 1e-9))
     more = [jnp.sum(jnp.where(weight > 0.0, weight * x, 0.0), axis=0) for x in each[1:]]
-    share = 1.0 + jnp.stack(more[:-2], axis=-1)
-    shape = Shape(thin_m=way.thin_m, share=share, closed=more[-2], walls=1.0 + more[-1], ground=way.ground, low=way.low)
+    shape = Shape(
+        thin_m=way.thin_m, scattered=jnp.stack(more[:-2], axis=-1), closed=more[-2], walls=1.0 + more[-1],
+        ground=way.ground, low=way.low,
+    )  # fmt: skip
     return replace(way.crossed, shape=shape)
 
 
@@ -140,7 +143,7 @@ def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size:
     n, place = wanted.shape[0], jnp.cumsum(wanted.astype(jnp.int32)) - 1
     size = min(size, n)
     rows = jnp.zeros(n + size, jnp.int32).at[jnp.where(wanted, place, n + size)].set(jnp.arange(n), mode="drop")
-    found = jnp.zeros((len(DEPTHS) + 3, n + size))
+    found = jnp.zeros((OUTPUTS + 3, n + size))
 
     def step(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         first, found = carry

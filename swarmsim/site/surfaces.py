@@ -1,83 +1,64 @@
-"""Photons that one box scatters into a detector, over those of an infinitely wide wall that the line crosses squarely.
+"""What of a box decides how many photons it scatters from one end of a line to the other.
 
 Each face of a hollow box is one surface, which source and detector look at from the same side or from both; a solid box
 is its middle plane, of each axis as far as the line leads through that one (`crossed_weights`). A place of the surface
 scatters
 
-    K dA / (d^2 d'^2),  K = F / (1 + r (1 - cos))^2 + m
+    K dA / (d^2 d'^2),  K = F / (1 + r (1 - cos))^2
 
 photons, with d, d' the distances of source and detector, c, c' the cosines there, and cos that of the angle between the
 ways to and from it. F is what scatters once and is not lost on its way through the wall, of depth t,
 
     (e^(-t / c) - e^(-g t / c')) / (g t / c' - t / c)         to the other side
-    b (1 - e^(-t / c - g t / c')) / (t / c + g t / c')        back
+    (1 - e^(-t / c - g t / c')) / (t / c + g t / c')          back
 
-g and b being for the photons' lower energy. Photons that scatter more often are in the constants, and m = M c^2 c' of
-them come through the deepest of `DEPTHS` where the line itself does not. The integral over a face between source and
-detector is taken at `NODES` x `NODES` places, Gauss-Legendre's in u = (x - x0) / sqrt((x - x0)^2 + h^2) on each edge,
-with x0 and h the place and the width of the part of the plane that contributes most; of the other faces one place does.
-The sum over the faces is divided by that of an infinite wall between the same two distances. What comes back from the
-other walls of a box passes one more on its way: it is multiplied by e^(-f t (1 + s o / (1 + o))), o being the line's
-metres in the wall over its thickness, less 1; what comes through both walls of a box between source and detector by
-e^(-l t o / (1 + k o)). All of this is computed for walls of `DEPTHS`, and `swarmsim.radiation.walls` interpolates by
-the depth that a line has.
+g being for the photons' lower energy. The integral over a face is taken at one place in
+u = (x - x0) / sqrt((x - x0)^2 + h^2) on each edge, with x0 and h the place and the width of the part of the plane that
+contributes most. The sums over the faces, of what passes them and of what they send back, are divided by that of an
+infinite wall between the same two distances.
 
-Constants are those of ``configs/elements/walls.csv``, fitted to the Monte Carlo by ``experiments/transport/walls.py``.
+They are features among others, lengths and distances over the box's size, of which `swarmsim.site.wall_network` makes
+the photons that arrive: the integral is known to a factor of two by one place, photons scatter more than once, in all
+walls of a box, and soften. All of this is symmetric in the axes and the sides of a box and continuous in the ends of
+the line.
 """
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.config.files import packaged_dir
-
-DEPTHS = (0.25, 0.75, 2.25, 6.75)
-"""Depths of a wall in mean free paths, each three times the one before."""
-NODES = 2
-"""Places along each edge of a face towards the detector."""
-AWAY = 1
-"""The same of the other faces."""
-MOVING = 0.25
-"""How near to a face a detector moves the places of the one opposite, over the box's half extent."""
+SEEN = (0.75, 6.75)
+"""Depths in mean free paths of the walls of which faces are looked at; the second is nine times the first."""
+WIDTH = 1.442  # of h; this and the next two were fitted to the Monte Carlo of buildings, without the other features
+SOFTER = 0.7975  # g
+FORWARD = 0.6962  # r
+FEATURES = (
+    "through_thin",  # ln of the sum of what passes faces, at each depth of `SEEN`
+    "through_thick",
+    "back_thin",  # of what comes back
+    "back_thick",
+    "slant",  # o / (1 + o), o being the line's metres in walls over the short way through them, less 1
+    "grazing",  # ln(o)
+    "place",  # of the matter along the line
+    "detector_way",  # ln of the detector's distance from the box over the line's length
+    "detector",  # ln of distances and lengths over the mean of the box's half extents: the detector's from the box,
+    "outside",  # the source's from the box,
+    "inside",  # its distance from the nearest face within, as such; outside negative, and at least -1
+    "detector_inside",  # that of the detector
+    "two",  # 1 where the line crosses two walls in turn
+    "hollow",  # 1, of a solid box 0
+    "thin",  # the short way through the walls
+    "narrow",  # the least and
+    "broad",  # the largest half extent
+)
 PARALLEL_M = 1e-4  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
 _LEAST_COSINE = 1e-3
-
-
-class Constants(NamedTuple):
-    """Of this module, and from ``growth`` on of `swarmsim.radiation.walls`."""
-
-    width: float  # of h
-    softer: float  # g
-    forward: float  # r
-    back: float  # b
-    diffuse: float  # M
-    inside: float  # ln of all from a source inside a box, and its change with t / (1 + t)
-    inside_depth: float
-    between: float  # the same for a box between source and detector
-    between_depth: float
-    between_slant: float  # l
-    between_steep: float  # k
-    lost: float  # f
-    lost_slant: float  # s
-    sides: float  # ln of what a box between source and detector returns, and its change with t
-    sides_depth: float
-    growth: float  # a
-    growth_depth: float  # b
-    depth: float  # c
-    energy: float  # v
-    energy_depth: float  # w
-
-
-@lru_cache(maxsize=1)
-def constants() -> Constants:
-    """The constants of the project's table."""
-    text = (packaged_dir() / "elements" / "walls.csv").read_text(encoding="utf-8")
-    rows = [line.split(",") for line in text.splitlines() if not line.startswith("#")][1:]
-    return Constants(**{name: float(value) for name, value in rows})
+_LEAST_SEEN = 3e-3
+_LEAST_SLANT = 0.03
+_LEAST_RATIO = 3e-3
 
 
 class Box(NamedTuple):
@@ -89,10 +70,11 @@ class Box(NamedTuple):
     wall_m: jax.Array  # [n] 0: solid
 
 
-class Shares(NamedTuple):
-    """What a box scatters."""
+class Surroundings(NamedTuple):
+    """What decides how a box scatters photons from the one end of a line to the other."""
 
-    share: list[jax.Array]  # DEPTHS of [n] over what a wide wall does that the line crosses squarely
+    features: list[jax.Array]  # FEATURES of [n]
+    among: jax.Array  # [n] 0..1: less where an end lies within matter
     closed: jax.Array  # [n] 1 where one end of the line lies in a hollow box
     walls: jax.Array  # [n] how many walls in turn the line crosses
     thin_m: jax.Array  # [n] length the shortest way through them
@@ -161,38 +143,59 @@ def least(x: list[jax.Array]) -> jax.Array:
     return jnp.minimum(jnp.minimum(x[0], x[1]), x[2])
 
 
-def scattered_share(box: Box, k: Constants | None = None) -> Shares:
+def surroundings(box: Box) -> Surroundings:
     """Of each line and the box that it meets."""
-    k = k or constants()
     hollow = (box.wall_m > 0.0) & (least(box.half) > box.wall_m)
     thickness = jnp.maximum(jnp.where(hollow, box.wall_m, least(box.half)), _LEAST_M)
     ends = [_outside(x, box.half, thickness) for x in (box.start, box.end)]
     walls = jnp.maximum(ends[0] + ends[1], 1.0)
     # kept in memory, here and below: fused into all that uses them, they would be computed once for each
     toward, away, walls = jax.lax.optimization_barrier((*_faces(box, hollow, walls), walls))
-    seen = jax.lax.optimization_barrier([_seen(toward, NODES, k), _seen(away, AWAY, k)])
+    seen = jax.lax.optimization_barrier([_seen(toward), _seen(away)])
     opposite = [toward.opposite, away.opposite]
     along = [b - a for a, b in zip(box.start, box.end, strict=True)]
     distance = jnp.sqrt(toward.squared)
     share, moment, thin = matter(box.start, along, box.half, box.wall_m, distance)
     share, moment, thin = jax.lax.optimization_barrier((share, moment, thin))
-    wide = jax.lax.optimization_barrier(_wide(moment / jnp.maximum(share, 1e-9), k))
-    between = jnp.where(hollow, walls - 1.0, 0.0)
-    inside, over = jnp.where(hollow, 2.0 - walls, 0.0), jnp.maximum(share / jnp.maximum(thin, 1e-9) - 1.0, 0.0)
-    found = []
-    for t, depth in enumerate(DEPTHS):
-        x = depth / (1.0 + depth)
-        lost = k.between_slant * depth * over / (1.0 + k.between_steep * over)
-        of_through = inside * (k.inside + k.inside_depth * x) + between * (k.between + k.between_depth * x - lost)
-        of_returned = between * (k.sides + k.sides_depth * depth)
-        of_returned -= k.lost * depth * (1.0 + k.lost_slant * over / (1.0 + over))
-        one = sum(_sum(jnp.where(x, s[t], 0.0)) for x, s in zip(opposite, seen, strict=True))
-        other = sum(_sum(jnp.where(x, 0.0, s[t])) for x, s in zip(opposite, seen, strict=True))
-        found.append((one * jnp.exp(of_through) + other * jnp.exp(of_returned)) / wide[t])
+    place = moment / jnp.maximum(share, 1e-9)
+    wide = _wide(place)
+    through = [sum(_sum(jnp.where(x, s[t], 0.0)) for x, s in zip(opposite, seen, strict=True)) for t in range(2)]
+    back = [sum(_sum(jnp.where(x, 0.0, s[t])) for x, s in zip(opposite, seen, strict=True)) for t in range(2)]
+    over = jnp.maximum(share / jnp.maximum(thin, 1e-9) - 1.0, 0.0)
+    size = jnp.maximum(jnp.cbrt(box.half[0] * box.half[1] * box.half[2]), _LEAST_M)
+    detector, source = _away(box.end, box.half), _away(box.start, box.half)
+    features = [
+        *(_log(x / w, _LEAST_SEEN) for some in (through, back) for x, w in zip(some, wide, strict=True)),
+        over / (1.0 + over),
+        _log(over, _LEAST_SLANT),
+        place,
+        _log(detector / jnp.maximum(distance, _LEAST_M), _LEAST_RATIO),
+        *(_log(x / size, _LEAST_RATIO) for x in (detector, source)),
+        *(jnp.maximum(-most(_beyond(x, box.half)) / size, -1.0) for x in (box.start, box.end)),
+        jnp.where(hollow, walls - 1.0, 0.0),
+        jnp.where(hollow, 1.0, 0.0),
+        *(_log(x / size, _LEAST_RATIO) for x in (thin * distance, least(box.half), most(box.half))),
+    ]
     # an end within matter: as a slab, of a hollow box the more so the nearer it is to the middle of the wall
     among = jnp.where(hollow, jnp.abs((2.0 * ends[0] - 1.0) * (2.0 * ends[1] - 1.0)), ends[0] * ends[1])
-    shares = jax.lax.optimization_barrier([1.0 + among * (s - 1.0) for s in found])
-    return Shares(share=shares, closed=inside, walls=jnp.where(hollow, walls, 1.0), thin_m=thin * distance)
+    return Surroundings(
+        features=features, among=among, closed=jnp.where(hollow, 2.0 - walls, 0.0),
+        walls=jnp.where(hollow, walls, 1.0), thin_m=thin * distance,
+    )  # fmt: skip
+
+
+def _beyond(x: list[jax.Array], half: list[jax.Array]) -> list[jax.Array]:
+    return [jnp.abs(place) - h for place, h in zip(x, half, strict=True)]
+
+
+def _away(x: list[jax.Array], half: list[jax.Array]) -> jax.Array:
+    """Distance [n] from the box, 0 inside."""
+    a, b, c = (jnp.square(jnp.maximum(out, 0.0)) for out in _beyond(x, half))
+    return jnp.sqrt(a + b + c)
+
+
+def _log(x: jax.Array, smallest: float) -> jax.Array:
+    return jnp.log(jnp.maximum(x, 0.0) + smallest)
 
 
 def _sum(each: jax.Array) -> jax.Array:
@@ -202,8 +205,7 @@ def _sum(each: jax.Array) -> jax.Array:
 
 def _outside(x: list[jax.Array], half: list[jax.Array], thickness: jax.Array) -> jax.Array:
     """How far [n] from the inner surface (0) to the outer one (1) and beyond."""
-    out = [jnp.abs(place) - h for place, h in zip(x, half, strict=True)]
-    return jnp.clip(most(out) / thickness + 1.0, 0.0, 1.0)
+    return jnp.clip(most(_beyond(x, half)) / thickness + 1.0, 0.0, 1.0)
 
 
 class _Faces(NamedTuple):
@@ -216,7 +218,6 @@ class _Faces(NamedTuple):
     foot: tuple[jax.Array, jax.Array]  # the detector's foot
     squared: jax.Array  # [n] distance of source and detector, squared
     weight: jax.Array
-    apart: jax.Array  # 0..1 how far the places of the face lie from their middle
     opposite: jax.Array  # whether source and detector are on different sides
 
 
@@ -236,118 +237,76 @@ def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Face
             # the face between the ends, if there is one, and of two that the detector is nearer to
             within = jnp.abs(d) < plane
             side = jnp.where(jnp.where(within, s, d - s) > 0.0, sign, -sign)
-            # where the detector passes from the one case to the other, places of the face move together
-            near = jnp.abs(jnp.abs(d) - plane) / jnp.maximum(MOVING * box.half[axis], _LEAST_M)
-            apart = jnp.where(hollow & (d * s < 0.0), jnp.clip(near, 0.0, 1.0), 1.0)
             weight = jnp.where(hollow, 1.0 / walls, crossed[axis] * (0.5 + 0.5 * sign))
             spans = [x for j in range(3) if j != axis for x in (
                 edge - box.half[j] - box.start[j], box.half[j] - edge - box.start[j], box.end[j] - box.start[j]
             )]  # fmt: skip
-            rows.append((side * s - plane, side * d - plane, weight, apart, *spans))
+            rows.append((side * s - plane, side * d - plane, weight, *spans))
         rows = jax.lax.optimization_barrier(rows)
-        source, detector, weight, apart, l1, h1, f1, l2, h2, f2 = (jnp.stack(x) for x in zip(*rows, strict=True))
+        source, detector, weight, l1, h1, f1, l2, h2, f2 = (jnp.stack(x) for x in zip(*rows, strict=True))
         found.append(_Faces(
             source=source, detector=detector, low=(l1, l2), high=(h1, h2), foot=(f1, f2), squared=squared,
-            weight=weight, apart=apart, opposite=source * detector < 0.0,
+            weight=weight, opposite=source * detector < 0.0,
         ))  # fmt: skip
     return found[0], found[1]
 
 
-def _seen(faces: _Faces, nodes_of_edge: int, k: Constants) -> list[jax.Array]:
-    """What source and detector see of each face [3, n], at each of `DEPTHS`."""
+def _seen(faces: _Faces) -> list[jax.Array]:
+    """What source and detector see of each face [3, n], at each depth of `SEEN`."""
     s, d = jnp.abs(faces.source) + _LEAST_M, jnp.abs(faces.detector) + _LEAST_M
     near, far = s * s, d * d
     for low, high, foot in zip(faces.low, faces.high, faces.foot, strict=True):
         near += jnp.square(jnp.maximum(jnp.maximum(low, -high), 0.0))
         far += jnp.square(jnp.maximum(jnp.maximum(low - foot, foot - high), 0.0))
-    h = k.width * jnp.sqrt(near * far) / (jnp.sqrt(near) + jnp.sqrt(far))
+    h = WIDTH * jnp.sqrt(near * far) / (jnp.sqrt(near) + jnp.sqrt(far))
     part = near / (near + far)
-    # a face that is seen from one side has one place, whichever way the line runs
-    apart = jnp.where(faces.opposite, faces.apart, 0.0)
-    along, across = (
-        _along(low, high, foot * part, h, nodes_of_edge, apart) for low, high, foot in zip(*faces[2:5], strict=True)
-    )
-    scale = faces.weight * faces.squared * (1.0 / (2.0 * np.pi))
-    along, across, scale = jax.lax.optimization_barrier((along, across, scale))
-    nodes = []
-    for x, of_x in along:
-        for y, of_y in across:
-            u, v = faces.foot[0] - x, faces.foot[1] - y
-            one, two = jax.lax.rsqrt(x * x + y * y + s * s), jax.lax.rsqrt(u * u + v * v + d * d)
-            both = one * two
-            cosine = (x * u + y * v - faces.source * faces.detector) * both
-            weight = scale * of_x * of_y * both * both
-            nodes.append(_Node.at(weight, s * one, d * two, 1.0 - cosine, k))
-    return _kernels(jax.lax.optimization_barrier(nodes), faces.opposite, k)
+    (x, of_x), (y, of_y) = (
+        _middle(low, high, foot * part, h) for low, high, foot in zip(*faces[2:5], strict=True)
+    )  # fmt: skip
+    u, v = faces.foot[0] - x, faces.foot[1] - y
+    one, two = jax.lax.rsqrt(x * x + y * y + s * s), jax.lax.rsqrt(u * u + v * v + d * d)
+    both = one * two
+    cosine = (x * u + y * v - faces.source * faces.detector) * both
+    weight = faces.weight * faces.squared * (1.0 / (2.0 * np.pi)) * of_x * of_y * both * both
+    return _kernels(weight, s * one, d * two, 1.0 - cosine, faces.opposite)
 
 
-class _Node(NamedTuple):
-    """A place of a face."""
-
-    source: jax.Array  # cosines
-    detector: jax.Array
-    weight: jax.Array  # of what scatters once
-    turned: jax.Array  # over that, of what scatters more often
-    into: jax.Array  # e^(-t / c) and e^(-g t / c') of the first of `DEPTHS`
-    out: jax.Array
-
-    @staticmethod
-    def at(weight: jax.Array, source: jax.Array, detector: jax.Array, turned: jax.Array, k: Constants) -> "_Node":
-        """By its weight, the cosines, and 1 - cosine of the angle between the ways."""
-        c, d = jnp.maximum(source, _LEAST_COSINE), jnp.maximum(detector, _LEAST_COSINE)
-        often = jnp.square(1.0 + k.forward * turned)
-        return _Node(c, d, weight / often, often, jnp.exp(-DEPTHS[0] / c), jnp.exp(-k.softer * DEPTHS[0] / d))
+def _middle(low: jax.Array, high: jax.Array, middle: jax.Array, h: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The place along one edge, and its weight."""
+    first, last = (x * jax.lax.rsqrt(x * x + h * h) for x in (low - middle, high - middle))
+    u = 0.5 * (first + last)
+    root = jax.lax.rsqrt(jnp.maximum(1.0 - u * u, 1e-9))
+    return middle + h * u * root, (last - first) * h * root * root * root
 
 
-def _along(
-    low: jax.Array, high: jax.Array, middle: jax.Array, h: jax.Array, nodes: int, apart: jax.Array | float = 1.0
-) -> list[tuple[jax.Array, jax.Array]]:
-    """Places along one edge, and their weights; with ``apart`` 0 all in the middle."""
-    first, last = low - middle, high - middle
-    first, last = (x * jax.lax.rsqrt(x * x + h * h) for x in (first, last))
-    half, centre, found = 0.5 * (last - first), 0.5 * (first + last), []
-    for node, weight in zip(*np.polynomial.legendre.leggauss(nodes), strict=True):
-        u = centre + float(node) * apart * half
-        root = jax.lax.rsqrt(jnp.maximum(1.0 - u * u, 1e-9))
-        found.append((middle + h * u * root, float(weight) * half * h * root * root * root))
+def _kernels(
+    weight: jax.Array, source: jax.Array, detector: jax.Array, turned: jax.Array, opposite: jax.Array | bool
+) -> list[jax.Array]:
+    """K with its ``weight`` at each depth of `SEEN`, by the cosines, and 1 - cosine of the angle between the ways."""
+    c, d = jnp.maximum(source, _LEAST_COSINE), jnp.maximum(detector, _LEAST_COSINE)
+    weight = weight / jnp.square(1.0 + FORWARD * turned)
+    one, two, found = jnp.exp(-SEEN[0] / c), jnp.exp(-SOFTER * SEEN[0] / d), []
+    for number, depth in enumerate(SEEN):
+        if number:
+            one, two = (x * x * x for x in (one, two))
+            one, two = (x * x * x for x in (one, two))
+        into, out = depth / c, SOFTER * depth / d
+        apart = out - into
+        few = jnp.abs(apart) < 0.3
+        passed = jnp.where(
+            few, 0.5 * (one + two) * (1.0 - apart * apart / 12.0), (one - two) / jnp.where(few, 1.0, apart)
+        )
+        found.append(weight * jnp.where(opposite, passed, (1.0 - one * two) / (into + out)))
     return found
 
 
-def _kernels(nodes: list[_Node], opposite: jax.Array | bool, k: Constants) -> list[jax.Array]:
-    """Sums of K over places, at each of `DEPTHS`."""
-    found = []
-    for t, depth in enumerate(DEPTHS):
-        total = jnp.zeros_like(nodes[0].weight)
-        for node in nodes:
-            one, two = node.into, node.out
-            for _ in range(t):
-                one, two = one * one * one, two * two * two
-            into, out = depth / node.source, k.softer * depth / node.detector
-            apart = out - into
-            few = jnp.abs(apart) < 0.3
-            once = jnp.where(
-                few, 0.5 * (one + two) * (1.0 - apart * apart / 12.0), (one - two) / jnp.where(few, 1.0, apart)
-            )
-            passed = once
-            if depth == DEPTHS[-1]:
-                passed = once + k.diffuse * node.source * node.source * node.detector * node.turned
-            back = k.back * (1.0 - one * two) / (into + out)
-            total += node.weight * jnp.where(opposite, passed, back)
-        found.append(total)
-    return found
-
-
-def _wide(place: jax.Array, k: Constants) -> list[jax.Array]:
-    """The same sum [n] over an infinite wall that the line crosses squarely at ``place`` between its ends."""
+def _wide(place: jax.Array) -> list[jax.Array]:
+    """The same [n] of an infinite wall that the line crosses squarely at ``place`` between its ends: a place of each
+    quarter of it."""
     s = jnp.clip(place, 0.02, 0.98)
-    d, wide = 1.0 - s, jnp.full_like(s, 1e4)
-    along = _along(-wide, wide, jnp.zeros_like(s), k.width * s * d, NODES)[NODES // 2 :]  # it is symmetric
-    along = [(x, w if NODES % 2 and not j else 2.0 * w) for j, (x, w) in enumerate(along)]
-    nodes = []
-    for x, of_x in along:
-        for y, of_y in along:
-            one, two = jax.lax.rsqrt(x * x + y * y + s * s), jax.lax.rsqrt(x * x + y * y + d * d)
-            both = one * two
-            weight = of_x * of_y * both * both * (1.0 / (2.0 * np.pi))
-            nodes.append(_Node.at(weight, s * one, d * two, 1.0 - (s * d - x * x - y * y) * both, k))
-    return _kernels(nodes, True, k)
+    d = 1.0 - s
+    x, of_x = _middle(jnp.zeros_like(s), jnp.full_like(s, 1e4), jnp.zeros_like(s), WIDTH * s * d)
+    one, two = jax.lax.rsqrt(2.0 * x * x + s * s), jax.lax.rsqrt(2.0 * x * x + d * d)
+    both = one * two
+    weight = jnp.square(2.0 * of_x * both) * (1.0 / (2.0 * np.pi))
+    return _kernels(weight, s * one, d * two, 1.0 - (s * d - 2.0 * x * x) * both, True)

@@ -12,9 +12,10 @@ from experiments.transport.compare import ENERGIES_KEV, detector_of, efficiency
 from experiments.transport.ground import SOURCE_M, half_space, views
 from experiments.transport.sites import Block, modelled, site_of, ways
 from experiments.transport.walk import medium
-from experiments.transport.walls import Case, Drawn, deviations, drawn, fitted, known, lines_of, told
+from experiments.transport.walls import drawn, lines_of
+from experiments.transport.walls_fit import Rows, deviations, features_of, fitted
 from swarmsim.radiation import Detector, Library, load_library
-from swarmsim.site.surfaces import constants
+from swarmsim.site.wall_network import network, network_of
 
 SEED = 3
 TABLE, SHELLS = (Path(__file__).parent / name for name in ("walls.csv", "shells.csv"))
@@ -30,43 +31,9 @@ def detector(library: Library) -> Detector:
     return detector_of(library, "nai_2x2")
 
 
-def cases_of(kind: str) -> list[Drawn]:
-    rng = np.random.default_rng(SEED)
-    return [drawn(rng, kind) for _ in range(walls.RUNS[kind])]
-
-
-@pytest.mark.parametrize(("kind", "within_10", "within_25"), [("inside", 0.75, 0.95), ("wall", 0.8, 0.95)])
-def test_counts_of_drawn_cases_are_those_of_the_monte_carlo(
-    detector: Detector, kind: str, within_10: float, within_25: float
-) -> None:
-    """Cases that the constants were not fitted to; with walls as wide slabs 38 % and 20 % lie within 10 %."""
-    text = [line for line in TABLE.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
-    rows = [row for row in csv.DictReader(text) if row["kind"] == kind]
-    found = {}
-    for run, case in enumerate(cases_of(kind)):
-        site = site_of([case.block], detector.material_names, ground=False)
-        way = ways(site, *(jnp.asarray(x, jnp.float32) for x in (case.source_m, case.detectors_m)))
-        direct, scattered, ground = modelled(detector, ENERGIES_KEV.index(case.energy_kev), way)
-        assert float(jnp.max(ground)) < 1e-4
-        found[run] = np.asarray(direct, float), np.asarray(direct + scattered, float)
-    of_row = [(found[int(r["run"])], int(r["view"]), float(r["uncollided"]), float(r["scattered"])) for r in rows]
-    for (direct, _), view, uncollided, _ in of_row:
-        assert direct[view] == pytest.approx(uncollided, rel=0.02, abs=1e-5)
-    ratio = np.array([total[view] / (uncollided + scattered) for (_, total), view, uncollided, scattered in of_row])
-    assert len(ratio) > 150
-    assert np.median(ratio) == pytest.approx(1.0, abs=0.03)
-    assert np.mean(np.abs(ratio - 1.0) < 0.1) > within_10
-    assert np.mean(np.abs(ratio - 1.0) < 0.25) > within_25
-
-
-@pytest.mark.parametrize(
-    ("kind", "within_10", "within_25"),
-    [("inside", 0.8, 0.95), ("container", 0.9, 1.0), ("cube", 0.7, 0.95), ("wall", 0.8, 0.9), ("square", 1.0, 1.0),
-     ("behind", 0.4, 0.65), ("block", 0.8, 0.85)],
-)  # fmt: skip
-def test_counts_of_cases_known_to_2_percent(detector: Detector, kind: str, within_10: float, within_25: float) -> None:
-    """In buildings, containers and cubes, behind walls, buildings and blocks; wide walls that are crossed squarely."""
-    text = [line for line in SHELLS.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+def apart_of(detector: Detector, table: Path, kind: str) -> np.ndarray:
+    """Model over Monte Carlo of the cases of a kind in a table."""
+    text = [line for line in table.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     ratio = []
     for row in csv.DictReader(text):
         if row["kind"] != kind:
@@ -81,7 +48,34 @@ def test_counts_of_cases_known_to_2_percent(detector: Detector, kind: str, withi
         assert float(direct[0]) == pytest.approx(uncollided, rel=0.02, abs=1e-5)
         assert float(row["error"]) < 0.02 * (uncollided + known_scattered)
         ratio.append(float(direct[0] + scattered[0]) / (uncollided + known_scattered))
-    apart = np.abs(np.array(ratio) - 1.0)
+    return np.array(ratio)
+
+
+@pytest.mark.parametrize(
+    ("kind", "within_10", "within_25"),
+    [("inside", 0.92, 0.98), ("container", 0.95, 1.0), ("cube", 0.95, 1.0), ("wall", 0.88, 0.94),
+     ("square", 0.85, 0.95), ("behind", 0.7, 0.85), ("block", 0.6, 0.7)],
+)  # fmt: skip
+def test_counts_of_drawn_cases_are_those_of_the_monte_carlo(
+    detector: Detector, kind: str, within_10: float, within_25: float
+) -> None:
+    """Cases of `drawn` that the network was not fitted to."""
+    ratio = apart_of(detector, TABLE, kind)
+    apart = np.abs(ratio - 1.0)
+    assert len(ratio) >= 30
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.03)
+    assert np.mean(apart < 0.1) >= within_10
+    assert np.mean(apart < 0.25) >= within_25
+
+
+@pytest.mark.parametrize(
+    ("kind", "within_10", "within_25"),
+    [("inside", 0.92, 0.98), ("container", 0.95, 1.0), ("cube", 0.95, 1.0), ("wall", 0.85, 0.95), ("square", 1.0, 1.0),
+     ("behind", 0.6, 0.8), ("block", 0.8, 0.85)],
+)  # fmt: skip
+def test_counts_of_houses_and_sheds(detector: Detector, kind: str, within_10: float, within_25: float) -> None:
+    """Of concrete, brick, steel and lead, from up to 30 m: cases of a narrower range, none of which was fitted to."""
+    apart = np.abs(apart_of(detector, SHELLS, kind) - 1.0)
     assert len(apart) >= 12
     assert np.mean(apart < 0.1) >= within_10
     assert np.mean(apart < 0.25) >= within_25
@@ -114,37 +108,33 @@ def test_the_command_tells_cases_and_fits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(walls, "RUNS", {"inside": 2, "wall": 2})
-    walls.main(seeds=1, photons=2000, out=tmp_path)
+    walls.main(seeds=1, photons=2000, steps=10, out=tmp_path)
     rows = list(csv.DictReader((tmp_path / "walls.csv").read_text(encoding="utf-8").splitlines()))
     assert len(rows) == 4 * walls.VIEWS
-    shown = capsys.readouterr().out
-    assert "| in a closed building |" in shown
-    assert "Constants:\nwidth," in shown
+    assert "| in a closed building |" in capsys.readouterr().out
+    made = network_of((tmp_path / "network.csv").read_text(encoding="utf-8"))
+    assert [w.shape for w in made.weights] == [w.shape for w in network().weights]
 
 
-def test_the_fit_finds_constants_that_made_the_counts(detector: Detector) -> None:
-    """Cases whose counts are those of the model itself, and a start that differs."""
-    found, parts, lines = [], [], []
-    for kind in ("inside", "wall"):
-        for case in cases_of(kind)[:8]:
-            site = site_of([case.block], detector.material_names, ground=False)
-            way = ways(site, *(jnp.asarray(x, jnp.float32) for x in (case.source_m, case.detectors_m)))
-            direct, scattered, _ = (np.asarray(x, float) for x in modelled(
-                detector, ENERGIES_KEV.index(case.energy_kev), way
-            ))  # fmt: skip
-            parts.append(way)
-            lines.append(lines_of(case))
-            found += [
-                Case(kind, case.material, case.energy_kev, 0.1, 1, 0, d, s, 0.0, d + s)
-                for d, s in zip(direct, scattered, strict=True)
-            ]
-    assert len(known(found)) > 60
-    assert "| 100% | 100% |" in told(found)
-    way = walls.jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
-    made = constants()
-    start = made._replace(forward=1.3 * made.forward, inside=made.inside + 0.1)
-    apart = deviations(found, np.vstack(lines), way, detector)
-    before, after = (np.abs(np.asarray(apart(k))) for k in (start, fitted(apart, start)))
-    assert np.max(np.abs(np.asarray(apart(made)))) < 1e-3
-    assert np.median(before) > 0.05
-    assert np.quantile(after, 0.9) < 0.01
+def test_the_fit_finds_the_photons_of_the_cases() -> None:
+    """Cases whose counts are those of the project's network, a tenth of them too faint to be known."""
+    rng = np.random.default_rng(SEED)
+    drawn_cases = [drawn(rng, kind) for kind in ("inside", "wall", "behind") for _ in range(60)]
+    lines = np.vstack([lines_of(case) for case in drawn_cases])
+    features, _, _ = features_of(lines)
+    n = len(features)
+    rows = Rows(
+        features=features, depth=rng.uniform(0.1, 4.0, n), growth=rng.uniform(0.0, 1.5, n),
+        energy_kev=rng.choice([122.0, 356.0, 662.0], n), direct=np.full(n, 0.2), slab=np.full(n, 0.5),
+        counts=np.ones(n), error=np.full(n, 0.01), known=(rng.random(n) < 0.9).astype(float),
+    )  # fmt: skip
+    counts = np.exp(np.asarray(deviations(network(), device(rows)), float))
+    rows = rows._replace(counts=np.where(rows.known > 0.0, counts, 2.0 * counts))
+    found = np.abs(np.asarray(deviations(fitted(rows, lines, 3000), device(rows))))[rows.known > 0.0]
+    before = np.abs(np.log(counts / np.median(counts)))
+    assert np.median(before) > 0.1
+    assert np.quantile(found, 0.9) < 0.05
+
+
+def device(rows: Rows) -> Rows:
+    return Rows(*(jnp.asarray(x, jnp.float32) for x in rows))

@@ -13,7 +13,7 @@ from swarmsim.radiation.detector import Source
 from swarmsim.radiation.rate import roi_rates, roi_rates_and_slopes
 from swarmsim.site import Crossed
 from swarmsim.site.rays import Shape, stretched, wide
-from swarmsim.site.surfaces import DEPTHS
+from swarmsim.site.wall_network import COEFFICIENTS, OUTPUTS
 
 Detectors = dict[tuple[str, str], Detector]
 MATERIALS = ("air", "concrete", "steel")
@@ -35,11 +35,18 @@ def ways(detector: Detector, seed: int, count: int, walls: float = 0.3) -> tuple
     f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
     shape = Shape(
         thin_m=f32(length * np.where(rng.random(length.shape) < 0.5, 1.0, rng.uniform(0.3, 1.0, length.shape))),
-        share=f32(rng.uniform(0.1, 1.0, count)[:, None] * other.uniform(0.7, 1.4, (count, len(DEPTHS)))),
+        scattered=f32(_coefficients(rng.uniform(0.1, 1.0, count), other)),
         closed=f32(rng.integers(2, size=count)), walls=f32(other.uniform(1.0, 2.0, count)),
         ground=f32(np.sort(rng.uniform(0.0, 1.0, (count, 2)))[:, ::-1]), low=f32(other.uniform(0.0, 1.0, count)),
     )  # fmt: skip
     return Crossed(length_m=f32(length), place=f32(between), shape=shape), f32(place), f32(axis)
+
+
+def _coefficients(share: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Of walls with about that ``share``: they change with the energy and the growth as those of the network do."""
+    found = rng.normal(0.0, [0.15, 0.05, 0.05], (len(share), OUTPUTS // COEFFICIENTS, COEFFICIENTS))
+    found[:, :, 0] += np.log(share)[:, None]
+    return found.reshape(len(share), OUTPUTS)
 
 
 def thicker(way: Crossed, material: int, factor: float) -> Crossed:

@@ -11,8 +11,8 @@ from swarmsim.radiation import Detector, roi_rates, spectrum_rate
 from swarmsim.radiation.detector import AIR
 from swarmsim.radiation.rate import from_ground, line_rates, roi_rates_and_slopes, transmission
 from swarmsim.site import Crossed
-from swarmsim.site.rays import Shape
-from swarmsim.site.surfaces import DEPTHS, constants
+from swarmsim.site.rays import Shape, stretched
+from swarmsim.site.wall_network import COEFFICIENTS, DEPTHS, OUTPUTS, network
 from tests.radiation.points import point, through
 
 Detectors = dict[tuple[str, str], Detector]
@@ -21,12 +21,14 @@ PLACE, UP = jnp.array([0.0, 0.0, 10.0]), jnp.array([0.0, 0.0, 1.0])
 
 def shaped(
     way: Crossed, share: float | np.ndarray = 1.0, closed: float = 0.0, walls: float = 1.0, thin: float = 1.0,
-    ground: float = 0.0,
+    ground: float = 0.0, by: tuple[float, float] = (0.0, 0.0),
 ) -> Crossed:  # fmt: skip
-    """``way`` with all of its matter in such a wall."""
-    f32 = jnp.float32
+    """``way`` with all of its matter in such a wall; ``by`` are the coefficients of the energy and the growth."""
+    f32, of_photons = jnp.float32, np.zeros((len(DEPTHS), COEFFICIENTS))
+    of_photons[:, 0] = np.log(share)
+    of_photons[:, 1:] = by
     shape = Shape(
-        thin_m=way.length_m * thin, share=jnp.full(len(DEPTHS), share, f32), closed=f32(closed), walls=f32(walls),
+        thin_m=way.length_m * thin, scattered=f32(of_photons.reshape(OUTPUTS)), closed=f32(closed), walls=f32(walls),
         ground=jnp.full(2, ground, f32), low=f32(ground > 0.0),
     )  # fmt: skip
     return replace(way, shape=shape)
@@ -67,26 +69,43 @@ def test_derivatives_are_numbers_for_nuclides_of_few_lines_as_well(detectors: De
 
 @pytest.mark.parametrize("walls", [1.0, 2.0])
 def test_the_share_is_that_of_the_depth_of_a_wall(detectors: Detectors, walls: float) -> None:
-    d, share, line = detectors["nai_2x2", "physical"], np.array([0.5, 0.4, 0.8, 0.2]), 3  # the line of 662 keV
+    d, share, line = detectors["nai_2x2", "physical"], np.array([0.5, 0.4, 0.8, 0.2, 0.3]), 3  # the line of 662 keV
     mu = float(through(d, steel=1.0).length_m @ d.attenuation_1_m[d.nuclide_names.index("Cs-137"), line])
-    between = [0.5 * (0.4 + 0.8), 0.5, 0.2]
-    depths = [*DEPTHS, (DEPTHS[1] * DEPTHS[2]) ** 0.5, 0.1, 12.0]
+    between = [(0.4 * 0.8) ** 0.5, 0.5]
+    depths = [*DEPTHS, (DEPTHS[1] * DEPTHS[2]) ** 0.5, 0.1]
     for depth, expected in zip(depths, [*share, *between], strict=True):
         way = through(d, steel=depth * walls / mu)
         found = scattered(d, shaped(way, share=share, walls=walls))[line] / scattered(d, way)[line]
         assert found == pytest.approx(expected, rel=1e-3)
 
 
-def test_photons_go_to_and_fro_in_a_building(detectors: Detectors) -> None:
+def test_the_share_changes_with_the_energy_and_the_growth(detectors: Detectors) -> None:
     """By the formula of the module; the slab's growth is what is left of its counts."""
-    d, k, line = detectors["nai_2x2", "physical"], constants(), 3
-    way = through(d, concrete=0.1)
-    t = float(way.length_m @ d.attenuation_1_m[d.nuclide_names.index("Cs-137"), line])
-    slab, found = (scattered(d, each)[line] for each in (way, shaped(way, closed=1.0)))
-    growth, level, x = np.log(slab / t) + t, np.log(661.657 / 662.0), t / (1.0 + t)
-    expected = k.growth * growth + x * (k.growth_depth * growth + k.energy * level)
-    expected += x * x * (k.depth + k.energy_depth * level)
-    assert np.log(found / slab) == pytest.approx(expected, abs=1e-3)
+    d, by = detectors["nai_2x2", "physical"], (0.3, -0.2)
+    for nuclide, line in (("Cs-137", 3), ("Co-60", 0), ("Am-241", 0)):
+        n = d.nuclide_names.index(nuclide)
+        way = through(d, concrete=0.1)
+        t = float(way.length_m @ d.attenuation_1_m[n, line])
+        slab, found = (scattered(d, each, nuclide)[line] for each in (way, shaped(way, share=0.7, by=by)))
+        growth, level = np.log(slab / t) + t, np.log(float(d.line_energy_kev[n, line]) / 662.0)
+        lowest, highest, least, most = network().lines
+        expected = np.log(0.7) + by[0] * np.clip(level, lowest, highest) + by[1] * (np.clip(growth, least, most) - 1.0)
+        assert np.log(found / slab) == pytest.approx(expected, abs=2e-3)
+
+
+def test_derivatives_by_the_thickness_are_those_of_the_counts(detectors: Detectors) -> None:
+    """Of walls whose share changes with depth, energy and growth: against differences."""
+    d, share = detectors["nai_2x2", "physical"], np.array([0.5, 0.4, 0.8, 0.2, 0.3])
+    concrete = d.material_names.index("concrete")
+    for metres in (0.05, 0.11, 0.25):
+        way = shaped(through(d, concrete=metres), share=share, by=(0.3, -0.2))
+        more = [stretched(way, jnp.ones(len(d.material_names)).at[concrete].set(f)) for f in (0.99, 1.01)]
+        places, axes = PLACE[None], UP[None]
+        one = lambda w: jax.tree.map(lambda x: x[None], w)  # noqa: E731
+        rates = [roi_rates_and_slopes(d, point(d, "Cs-137"), one(w), places, axes, (concrete,)) for w in (way, *more)]
+        # of all regions together, to which it does not matter that the spectrum softens
+        difference = float(jnp.sum(rates[2][0] - rates[1][0])) / 0.02
+        assert float(jnp.sum(rates[0][1])) == pytest.approx(difference, rel=0.01)
 
 
 def test_scattered_photons_take_the_short_way(detectors: Detectors) -> None:

@@ -1,0 +1,60 @@
+"""The network of walls: its table, and what keeps it from telling nonsense."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.radiation.walls import HIGHEST
+from swarmsim.site.surfaces import FEATURES, Box
+from swarmsim.site.wall_network import COEFFICIENTS, DEPTHS, OUTPUTS, network, network_of, outputs, scattered, table_of
+
+
+def test_a_table_gives_the_network_that_it_was_made_of():
+    net = network()
+    again = network_of(table_of(net))
+    for one, other in zip(
+        (*net[:5], *net.weights, *net.biases), (*again[:5], *again.weights, *again.biases), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-4)
+
+
+def test_a_table_of_another_shape_is_refused():
+    lines = table_of(network()).splitlines()
+    last = max(i for i, line in enumerate(lines) if line.startswith("weights0"))
+    with pytest.raises(ValueError, match="do not lead from"):
+        network_of("\n".join(lines[:last] + lines[last + 1 :]))
+
+
+def test_its_layers_are_those_of_the_formula():
+    net, rng = network(), np.random.default_rng(3)
+    features = rng.uniform(net.low, net.high, (40, len(FEATURES))).astype(np.float32)
+    x = (features.astype(float) - net.middle) / net.scale
+    for number, (weights, biases) in enumerate(zip(net.weights, net.biases, strict=True)):
+        if number:
+            x = 0.5 * (x + np.sqrt(x * x + 1.0))
+        x = x @ weights.T.astype(float) + biases
+    np.testing.assert_allclose(outputs(jnp.asarray(features.T)).T, x, atol=2e-3)
+
+
+def test_what_is_beyond_all_that_it_was_fitted_to_is_as_at_the_end():
+    net = network()
+    beyond = net.high + 1e3 * (net.high - net.low)
+    ends, found = (outputs(jnp.asarray(x, jnp.float32)[:, None]) for x in (net.high, beyond))
+    np.testing.assert_array_equal(ends, found)
+
+
+def test_no_building_scatters_out_of_all_proportion():
+    """Of a hundred thousand lines at random, through walls up to the depth that is fitted to."""
+    rng, n = np.random.default_rng(5), 100_000
+    half = np.exp(rng.uniform(np.log(0.2), np.log(20.0), (n, 3)))
+    wall = np.where(rng.random(n) < 0.3, 0.0, np.exp(rng.uniform(np.log(0.001), np.log(0.4), n)))
+    start, end = (rng.normal(size=(n, 3)) * np.exp(rng.uniform(-1.0, 4.0, (n, 1))) for _ in range(2))
+    columns = [list(jnp.asarray(x.T, jnp.float32)) for x in (start, end, half)]
+    found, around = scattered(Box(*columns, jnp.asarray(wall, jnp.float32)))
+    found = np.asarray(found)[:, np.asarray(around.thin_m) > 1e-4].reshape(len(DEPTHS), COEFFICIENTS, -1)
+    assert len(DEPTHS) * COEFFICIENTS == OUTPUTS
+    for level, growth in ((-2.0, 0.3), (0.0, 1.0), (0.7, 1.5)):
+        share = found[:, 0] + found[:, 1] * level + found[:, 2] * (growth - 1.0)
+        assert np.isfinite(share).all()
+        # more than the bare source's counts: next to never, and `swarmsim.radiation.walls` does not believe it
+        assert np.mean(share > HIGHEST[:, None]) < 0.01
