@@ -114,20 +114,23 @@ def drawn(rng: np.random.Generator, kind: str) -> Drawn:
         y, z = between(8.0, 15.0), between(8.0, 15.0)
     elif kind == "block":
         x, y, z = (between(0.3, 5.0) * THICKNESS_M[material][1] for _ in range(3))
+        if rng.random() < 0.4:  # a post, or a trunk
+            x, y, z = between(0.05, 0.6), between(0.05, 0.6), between(1.0, 8.0)
+            material = str(rng.choice(["wood", "concrete", "brick", "steel"], p=[0.6, 0.15, 0.15, 0.1]))
     low, high = np.array([-x, -y, -z if kind in ("cube", "square") else 0.0]), np.array([x, y, z])
     if kind == "cube":
         source = np.zeros(3)
     elif kind in ENCLOSED:
         least, most = low + thickness, high - thickness
-        margin = np.minimum(0.25, 0.3 * (most - least))
+        margin = np.minimum(between(0.02, 0.25), 0.3 * (most - least))
         source = rng.uniform(least + margin, most - margin)
         if rng.random() < 0.5:
             source[2] = least[2] + min(0.5, 0.4 * (most[2] - least[2]))
     elif kind in ("behind", "block"):
-        source = np.array([-x - between(0.2, 40.0), rng.uniform(-y, y), rng.uniform(min(0.3, 0.5 * z), min(2.0, z))])
+        source = np.array([-x - between(0.01, 40.0), rng.uniform(-y, y), rng.uniform(min(0.3, 0.5 * z), min(2.0, z))])
     else:
         low[0], high[0] = -0.5 * thickness, 0.5 * thickness
-        near, far, aside = (0.2, 40.0, y) if kind == "wall" else (0.3, 8.0, 1.0)
+        near, far, aside = (0.01, 40.0, y) if kind == "wall" else (0.3, 8.0, 1.0)
         source = np.array([low[0] - between(near, far), rng.uniform(-aside, aside), rng.uniform(0.3, min(2.0, z))])
     block = Block(tuple(low), tuple(high), 0.0 if kind in SOLID else thickness, material)
     pieces = np.array([[low, high]]) if kind in SOLID else shell_of(low, high, thickness)
