@@ -3,7 +3,7 @@
     python -m experiments.transport.walls [--seeds 3] [--photons N] [--out FOLDER]
 
 writes ``walls.csv``, prints how far the model is from the Monte Carlo, fits the network to all but the last set of
-cases, and writes it as ``network.csv``: the rows of ``configs/elements/walls.csv``, which are of 210 sets and take ten
+cases, and writes it as ``network.csv``: the rows of ``configs/elements/walls.csv``, which are of 250 sets and take ten
 minutes on one H100. Thirty minutes on one core for three.
 """
 
