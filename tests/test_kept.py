@@ -10,6 +10,7 @@ import pytest
 
 import swarmsim
 from swarmsim import kept as module
+from swarmsim import store
 from swarmsim.config.load import load_all
 from swarmsim.kept import kept, stored
 from swarmsim.pytree import on_device, pytree, static
@@ -143,3 +144,14 @@ def test_every_shipped_detector_has_a_text_of_its_own() -> None:
     ]
     assert len(set(texts)) == len(texts) >= 2 * len(load_all("detectors"))
     assert len({module._text(mount) for mount in mounts}) >= 2
+
+
+def test_another_table_is_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Programs hold the tables of ``elements`` as constants."""
+    monkeypatch.setattr(store, "packaged_dir", lambda: tmp_path)
+    (tmp_path / "elements").mkdir()
+    versions = []
+    for text in ("name,1.0\n", "name,1.5\n", "name,1.0\n"):
+        (tmp_path / "elements" / "walls.csv").write_text(text, encoding="utf-8")
+        versions.append(store.package_digest.__wrapped__())
+    assert versions[0] == versions[2] != versions[1]
