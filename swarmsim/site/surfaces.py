@@ -19,8 +19,8 @@ infinite wall between the same two distances.
 
 They are features among others, lengths and distances over the box's size, of which `swarmsim.site.wall_network` makes
 the photons that arrive: the integral is known to a factor of two by one place, photons scatter more than once, in all
-walls of a box, and soften. All of this is symmetric in the axes and the sides of a box and continuous in the ends of
-the line.
+walls of a box, and soften. All of this is symmetric in the axes and the sides of a box, and continuous in the ends of
+the line but for what a face sends back, which begins at once where the detector passes the face's plane.
 """
 
 from typing import NamedTuple
