@@ -14,7 +14,7 @@ from swarmsim.radiation.walls import REFERENCE_KEV, log_share
 from swarmsim.site.surfaces import FEATURES, Box, surroundings
 from swarmsim.site.wall_network import COEFFICIENTS, OUTPUTS, Network, outputs
 
-UNITS = (32, 32)  # of the hidden layers
+UNITS = (40, 40)
 BATCH = 2048
 AT_ONCE = 1000  # steps
 RATE = 4e-3  # of the first step; it falls to nothing like a cosine

@@ -20,7 +20,7 @@ infinite wall between the same two distances.
 They are features among others, lengths and distances over the box's size, of which `swarmsim.site.wall_network` makes
 the photons that arrive: the integral is known to a factor of two by one place, photons scatter more than once, in all
 walls of a box, and soften. All of this is symmetric in the axes and the sides of a box, and continuous in the ends of
-the line but for what a face sends back, which begins at once where the detector passes the face's plane.
+the line.
 """
 
 from typing import NamedTuple
@@ -42,6 +42,8 @@ FEATURES = (
     "slant",  # o / (1 + o), o being the line's metres in walls over the short way through them, less 1
     "grazing",  # ln(o)
     "place",  # of the matter along the line
+    "between",  # share of the line that lies inside the walls
+    "first",  # share of the matter that lies before that
     "detector_way",  # ln of the detector's distance from the box over the line's length
     "detector",  # ln of distances and lengths over the mean of the box's half extents: the detector's from the box,
     "outside",  # the source's from the box,
@@ -55,10 +57,11 @@ FEATURES = (
 )
 PARALLEL_M = 1e-4  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
-_LEAST_COSINE = 1e-3
-_LEAST_SEEN = 3e-3
-_LEAST_SLANT = 0.03
+_LEAST_COSINE = 1e-4
+_LEAST_SEEN = 0.02
+_LEAST_SLANT = 0.15
 _LEAST_RATIO = 3e-3
+_LEAST_THIN = 0.01
 
 
 class Box(NamedTuple):
@@ -68,6 +71,16 @@ class Box(NamedTuple):
     end: list[jax.Array]
     half: list[jax.Array]
     wall_m: jax.Array  # [n] 0: solid
+
+
+class Matter(NamedTuple):
+    """What segments cross of boxes [K]; lengths over the segment's."""
+
+    share: jax.Array  # length in matter
+    moment: jax.Array  # integral of the place along the segment over it
+    thin: jax.Array  # the shortest way through each piece of matter
+    between: jax.Array  # length inside the walls of a hollow box
+    first: jax.Array  # 0..1: share of the matter that lies before that, of a solid one half
 
 
 class Surroundings(NamedTuple):
@@ -82,12 +95,11 @@ class Surroundings(NamedTuple):
 
 def matter(
     start: list[jax.Array], along: list[jax.Array], outer: list[jax.Array], wall_m: jax.Array, distance: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What segments of length ``distance`` cross of boxes [K], over that length: see `Box` for the other arguments.
+) -> Matter:
+    """What segments of length ``distance`` cross of boxes: see `Box` for the other arguments.
 
-    Returns the length in matter, the integral of the place along the segment over it, and the length the shortest way
-    through each piece of matter; of a hollow box these are a wall before its inside and one after it, and of a solid
-    one its halves before and after its middle. An end within matter has what is between it and the inside or middle.
+    Pieces of matter are of a hollow box a wall before its inside and one after it, and of a solid one its halves before
+    and after its middle. An end within matter has what is between it and the inside or middle.
     """
     middle, reach = slabs(start, along)
     inner = [half - wall_m for half in outer]
@@ -102,7 +114,11 @@ def matter(
     wall = jnp.where(hollow, wall_m, _mean(crossed_weights(along, outer), outer)) / jnp.maximum(distance, 1e-9)
     before, after = (wall * _outside(x, outer, thickness) for x in (start, end))
     each = jnp.minimum(enter - first, before) + jnp.minimum(last - leave, after)
-    return share, moment, jnp.minimum(share, jnp.where(empty > 0.0, each, before + after))
+    middle_place = jnp.clip(0.5 * (enter + leave), first, jnp.maximum(first, last))
+    return Matter(
+        share=share, moment=moment, thin=jnp.minimum(share, jnp.where(empty > 0.0, each, before + after)),
+        between=empty, first=jnp.where(empty > 0.0, enter - first, middle_place - first) / jnp.maximum(share, 1e-9),
+    )  # fmt: skip
 
 
 def crossed_weights(along: list[jax.Array], half: list[jax.Array]) -> list[jax.Array]:
@@ -155,8 +171,8 @@ def surroundings(box: Box) -> Surroundings:
     opposite = [toward.opposite, away.opposite]
     along = [b - a for a, b in zip(box.start, box.end, strict=True)]
     distance = jnp.sqrt(toward.squared)
-    share, moment, thin = matter(box.start, along, box.half, box.wall_m, distance)
-    share, moment, thin = jax.lax.optimization_barrier((share, moment, thin))
+    met = matter(box.start, along, box.half, box.wall_m, distance)
+    share, moment, thin, between, first = jax.lax.optimization_barrier(met)
     place = moment / jnp.maximum(share, 1e-9)
     wide = _wide(place)
     through = [sum(_sum(jnp.where(x, s[t], 0.0)) for x, s in zip(opposite, seen, strict=True)) for t in range(2)]
@@ -169,12 +185,15 @@ def surroundings(box: Box) -> Surroundings:
         over / (1.0 + over),
         _log(over, _LEAST_SLANT),
         place,
+        between,
+        first,
         _log(detector / jnp.maximum(distance, _LEAST_M), _LEAST_RATIO),
         *(_log(x / size, _LEAST_RATIO) for x in (detector, source)),
         *(jnp.maximum(-most(_beyond(x, box.half)) / size, -1.0) for x in (box.start, box.end)),
         jnp.where(hollow, walls - 1.0, 0.0),
         jnp.where(hollow, 1.0, 0.0),
-        *(_log(x / size, _LEAST_RATIO) for x in (thin * distance, least(box.half), most(box.half))),
+        _log(thin * distance / size, _LEAST_THIN),
+        *(_log(x / size, _LEAST_RATIO) for x in (least(box.half), most(box.half))),
     ]
     # an end within matter: as a slab, of a hollow box the more so the nearer it is to the middle of the wall
     among = jnp.where(hollow, jnp.abs((2.0 * ends[0] - 1.0) * (2.0 * ends[1] - 1.0)), ends[0] * ends[1])

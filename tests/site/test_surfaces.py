@@ -69,7 +69,7 @@ def test_shares_are_continuous_around_a_house(first, last):
         assert (share[:, met] >= 0.0).all()
         # in steps of 0.03 to 0.2 mm; of the deepest walls nothing is counted but what comes around them
         one, other = share[:4, :-1][:, both], share[:4, 1:][:, both]
-        assert np.max(np.minimum(np.abs(other - one) / 0.01, np.abs(np.log(other / one)) / 0.06)) < 1.0
+        assert np.max(np.minimum(np.abs(other - one) / 0.006, np.abs(np.log(other / one)) / 0.03)) < 1.0
 
 
 def test_a_source_that_leaves_through_a_wall_changes_nothing_at_once():
@@ -77,7 +77,7 @@ def test_a_source_that_leaves_through_a_wall_changes_nothing_at_once():
     place = np.stack([np.linspace(-4.0, -7.0, 30_001), np.full(30_001, 0.4), np.full(30_001, 0.2)], axis=1)
     share, closed, walls, thin = shares(place, (25.0, 1.0, 0.5))
     for each in (*np.log(share[:4]), closed, walls, thin / WALL_M):
-        assert np.max(np.abs(np.diff(each))) < 0.04
+        assert np.max(np.abs(np.diff(each))) < 0.02
     assert (closed[0], walls[0], closed[-1], walls[-1]) == (1.0, 1.0, 0.0, 2.0)
 
 
