@@ -342,7 +342,7 @@ def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax
 def _of_boxes(
     obstacles: Obstacles, a: jax.Array, direction: jax.Array, distance: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The share, moment and short way of `matter` of each box [K]. Written per component, so that the boxes are the vectorised axis."""
+    """The first three of `matter` of each box [K]. Written per component: the boxes are the vectorised axis."""
     start, along = in_axes(obstacles, a - obstacles.centre_m), in_axes(obstacles, direction)
     half = [obstacles.half_extent_m[:, k] for k in range(3)]
     return matter(start, along, half, obstacles.wall_m, distance)[:3]
