@@ -28,6 +28,9 @@ EDGES = 0.2  # of those
 WITHIN = 20  # one in so many lines leads out of a wall as well
 WITHIN_ERROR = 0.4
 EDGE_ERROR = 0.04
+DEEP = 0.15  # cases with deeper matter, over all others
+DEEPER = (1.5, 6.0)  # so many times
+DEEPEST = 40.0  # mean free paths
 NOTHING = 1e-7  # counts, whose logarithm is a number
 
 
@@ -92,6 +95,20 @@ def within(rng: np.random.Generator, rows: Rows, lines: Floats) -> Rows:
     )  # fmt: skip
 
 
+def deeper(rng: np.random.Generator, rows: Rows, n: int) -> Rows:
+    """``n`` of the cases with the matter 1.5 to 6 times as deep: no more than before comes through any of it."""
+    like = rng.integers(0, len(rows.depth), n)
+    growth, features = rows.growth[like], rows.features[like]
+    times = np.exp(rng.uniform(*np.log(DEEPER), n))
+    depth = np.minimum(rows.depth[like] * times, DEEPEST)
+    whole = depth * (1.0 + features[:, FEATURES.index("two")])
+    return Rows(
+        features=features, depth=depth, growth=growth, energy_kev=rows.energy_kev[like],
+        direct=rows.direct[like] ** times, slab=whole * np.exp(growth - whole), counts=rows.counts[like],
+        error=rows.error[like], known=np.zeros(n),
+    )  # fmt: skip
+
+
 def deviations(net: Network, rows: Rows) -> jax.Array:
     """ln of model over Monte Carlo [n]."""
     of = outputs(rows.features.T, net).T
@@ -108,7 +125,8 @@ def fitted(rows: Rows, lines: Floats, steps: int, seed: int = 0) -> Network:
     low, high = np.quantile(rows.features, [OUTLIERS, 1.0 - OUTLIERS], axis=0)
     levels = np.log(np.array([rows.energy_kev.min(), rows.energy_kev.max()]) / REFERENCE_KEV)
     ranges = np.concatenate([levels, np.quantile(rows.growth, [OUTLIERS, 1.0 - OUTLIERS])])
-    more = wide(rng, rows, int(WIDE * len(rows.depth))), within(rng, rows, lines[::WITHIN])
+    count = len(rows.depth)
+    more = wide(rng, rows, int(WIDE * count)), within(rng, rows, lines[::WITHIN]), deeper(rng, rows, int(DEEP * count))
     rows = Rows(*(jnp.asarray(np.concatenate(x), jnp.float32) for x in zip(rows, *more, strict=True)))
     clipped = np.clip(np.asarray(rows.features), low, high)
     sizes = (len(FEATURES), *UNITS, OUTPUTS)

@@ -32,7 +32,6 @@ HOPELESS = 0.4  # of the threshold: the ratio at the best of the starts below wh
 APART_M = 12.0  # between starts
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
-CLOSE = 0.5  # of the least standard deviation of the place: the last round follows one with a reach below that
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 
@@ -302,11 +301,7 @@ def _best(
         anew = number >= BEGINNINGS
         before = replace(best, fit=replace(best.fit, value=jnp.where(anew, -jnp.inf, best.fit.value)))
         best, values = best_of(tolerant, others, u, screen, candidates, before)
-        # the posterior is sampled about the best place anyway
-        information = problem.learning_rate * jnp.trace(best.fit.towards[:2, :2])
-        close = (number >= closer) & (jnp.square(reaches[number]) * information < CLOSE**2)
-        following = jnp.where(close, jnp.maximum(number + 1, reaches.shape[0] - 1), number + 1)
-        return following, best, jnp.where(named, values[:known], table)
+        return number + 1, best, jnp.where(named, values[:known], table)
 
     def on(carry: tuple[jax.Array, Tried, jax.Array]) -> jax.Array:
         number, best, _ = carry

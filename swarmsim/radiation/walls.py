@@ -19,9 +19,9 @@ from swarmsim.site.rays import Crossed
 from swarmsim.site.wall_network import COEFFICIENTS, DEPTHS, Array, Network, network
 
 REFERENCE_KEV = 662.0
-HIGHEST = np.log(2.0) + np.array(DEPTHS) - np.log(DEPTHS)
-"""Of ln P at each of `DEPTHS`: with a growth of 0 twice the counts of the bare source would arrive. No case that the
-network was fitted to comes near; it holds for lines like none of those."""
+MOST = 2.0
+"""Scattered counts over those of the bare source. No case that the network was fitted to has more; it holds for lines
+like none of those."""
 _LEAST_M = 1e-6
 
 
@@ -90,7 +90,10 @@ def scattered_counts(
     lines = (net or network()).lines
     at_walls = depth * of_walls / way.shape.walls[..., None]
     ln_share, by_ln_depth, by_growth = log_share(way.shape.scattered, at_walls, energy_kev, growth, lines)
-    share, falling = jnp.exp(ln_share), jnp.exp(growth - depth)
+    highest = float(np.log(MOST)) + depth - jnp.log(depth + 1e-9) - growth
+    free = ln_share < highest
+    by_ln_depth, by_growth = jnp.where(free, by_ln_depth, depth - 1.0), jnp.where(free, by_growth, -1.0)
+    share, falling = jnp.exp(jnp.minimum(ln_share, highest)), jnp.exp(growth - depth)
     seen, of_share = 1.0 + of_walls * (share - 1.0), of_walls * share
     # a thicker wall makes up more of the depth
     by_walls = share - 1.0 + share * by_ln_depth + (of_share * by_growth + seen) * mixed
@@ -116,9 +119,8 @@ def log_share(
     at = jnp.log(jnp.maximum(depth, 1e-6) / DEPTHS[0]) / step
     k = scattered[..., None, :]
     rows = [k[..., n : n + COEFFICIENTS] for n in range(0, k.shape[-1], COEFFICIENTS)]
-    free = [row[..., 0] + row[..., 1] * level + row[..., 2] * of_growth for row in rows]
-    logs = [jnp.minimum(x, float(most)) for x, most in zip(free, HIGHEST, strict=True)]
-    by = [jnp.where(x < most, row[..., 2], 0.0) for row, x, most in zip(rows, free, HIGHEST, strict=True)]
+    logs = [row[..., 0] + row[..., 1] * level + row[..., 2] * of_growth for row in rows]
+    by = [row[..., 2] for row in rows]
     found, by_growth, by_depth = logs[0], by[0], jnp.zeros_like(at)
     for number in range(len(DEPTHS) - 1):
         part, change = jnp.clip(at - number, 0.0, 1.0), logs[number + 1] - logs[number]

@@ -57,7 +57,7 @@ FEATURES = (
 )
 PARALLEL_M = 1e-4  # over the whole segment; a smaller component of its direction is parallel to the slab
 _LEAST_M = 1e-3  # from a plane, for rounding
-_LEAST_COSINE = 1e-4
+_LEAST_COSINE = 1e-6
 _LEAST_SEEN = 0.02
 _LEAST_SLANT = 0.15
 _LEAST_RATIO = 3e-3
@@ -102,8 +102,8 @@ def matter(
     and after its middle. An end within matter has what is between it and the inside or middle.
     """
     middle, reach = slabs(start, along)
-    inner = [half - wall_m for half in outer]
-    hollow = (wall_m > 0.0) & (least(inner) > 0.0)
+    hollow = (wall_m > 0.0) & (least(outer) > wall_m)
+    inner = [half - jnp.where(hollow, wall_m, 0.0) for half in outer]
     first, last = part_inside(middle, reach, outer)
     enter, leave = part_inside(middle, reach, inner)
     whole, empty = jnp.maximum(last - first, 0.0), jnp.where(hollow, jnp.maximum(leave - enter, 0.0), 0.0)
@@ -114,10 +114,13 @@ def matter(
     wall = jnp.where(hollow, wall_m, _mean(crossed_weights(along, outer), outer)) / jnp.maximum(distance, 1e-9)
     before, after = (wall * _outside(x, outer, thickness) for x in (start, end))
     each = jnp.minimum(enter - first, before) + jnp.minimum(last - leave, after)
-    middle_place = jnp.clip(0.5 * (enter + leave), first, jnp.maximum(first, last))
+    # of a line that passes the inside by: the less of it counts, the farther it passes, until both halves are alike
+    one, other = jnp.clip(enter - first, 0.0, whole), jnp.clip(last - leave, 0.0, whole)
+    past = jnp.clip((enter - leave) / jnp.maximum(whole, 1e-9), 0.0, 1.0)
+    lead = 0.5 * (one - other) / jnp.maximum(one + other, 1e-9) * (1.0 - past)
     return Matter(
         share=share, moment=moment, thin=jnp.minimum(share, jnp.where(empty > 0.0, each, before + after)),
-        between=empty, first=jnp.where(empty > 0.0, enter - first, middle_place - first) / jnp.maximum(share, 1e-9),
+        between=empty, first=jnp.where(hollow, 0.5 + lead, 0.5),
     )  # fmt: skip
 
 
@@ -272,7 +275,8 @@ def _faces(box: Box, hollow: jax.Array, walls: jax.Array) -> tuple[_Faces, _Face
 
 def _seen(faces: _Faces) -> list[jax.Array]:
     """What source and detector see of each face [3, n], at each depth of `SEEN`."""
-    s, d = jnp.abs(faces.source) + _LEAST_M, jnp.abs(faces.detector) + _LEAST_M
+    source, detector = jnp.abs(faces.source), jnp.abs(faces.detector)
+    s, d = source + _LEAST_M, detector + _LEAST_M
     near, far = s * s, d * d
     for low, high, foot in zip(faces.low, faces.high, faces.foot, strict=True):
         near += jnp.square(jnp.maximum(jnp.maximum(low, -high), 0.0))
@@ -287,7 +291,8 @@ def _seen(faces: _Faces) -> list[jax.Array]:
     both = one * two
     cosine = (x * u + y * v - faces.source * faces.detector) * both
     weight = faces.weight * faces.squared * (1.0 / (2.0 * np.pi)) * of_x * of_y * both * both
-    return _kernels(weight, s * one, d * two, 1.0 - cosine, faces.opposite)
+    # what passes a face and what comes back are both nothing where an end lies in its plane
+    return _kernels(weight, source * one, detector * two, 1.0 - cosine, faces.opposite)
 
 
 def _middle(low: jax.Array, high: jax.Array, middle: jax.Array, h: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -10,6 +10,7 @@ import pytest
 from swarmsim.radiation import Detector, roi_rates, spectrum_rate
 from swarmsim.radiation.detector import AIR
 from swarmsim.radiation.rate import from_ground, line_rates, roi_rates_and_slopes, transmission
+from swarmsim.radiation.walls import MOST
 from swarmsim.site import Crossed
 from swarmsim.site.rays import Shape, stretched
 from swarmsim.site.wall_network import COEFFICIENTS, DEPTHS, OUTPUTS, network
@@ -50,6 +51,20 @@ def test_a_wall_scatters_as_far_as_it_is_seen_and_air_does_not_care(detectors: D
     wall, air = through(d, concrete=0.1), through(d, air=30.0)
     np.testing.assert_allclose(scattered(d, shaped(wall, share=0.3)), 0.3 * scattered(d, wall), rtol=1e-5)
     np.testing.assert_allclose(scattered(d, shaped(air, share=0.3, closed=1.0)), scattered(d, air), rtol=1e-4)
+
+
+def test_no_wall_makes_much_more_of_a_source(detectors: Detectors) -> None:
+    """Whatever a table may say of what it was not fitted to."""
+    d = detectors["nai_2x2", "physical"]
+    for metres in (0.03, 0.3, 1.0, 3.0):
+        for walls in (1.0, 2.0):
+            way = shaped(through(d, concrete=metres), share=1e12, walls=walls)
+            assert scattered(d, way).max() < 1.001 * MOST
+            assert metres > 1.0 or scattered(d, way).max() > 0.999 * MOST
+            _, slopes = roi_rates_and_slopes(
+                d, point(d, "Cs-137"), jax.tree.map(lambda x: x[None], way), PLACE[None], UP[None], (0,)
+            )  # fmt: skip
+            assert np.isfinite(slopes).all()
 
 
 def test_derivatives_are_numbers_for_nuclides_of_few_lines_as_well(detectors: Detectors) -> None:

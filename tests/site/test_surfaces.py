@@ -23,7 +23,7 @@ def shares(start, end, half=HOUSE, wall=WALL_M):
     start, end = (np.atleast_2d(np.asarray(x, np.float32)) for x in (start, end))
     n = max(len(start), len(end))
     rows = [np.broadcast_to(x, (n, 3)) for x in (start, end, np.asarray(half, np.float32))]
-    return [np.asarray(x) for x in _shares(*rows, np.full(n, wall, np.float32))]
+    return [np.asarray(x) for x in _shares(*rows, np.broadcast_to(np.float32(wall), n))]
 
 
 @pytest.mark.parametrize("near", [0.5, 2.0, 5.0, 9.0])
@@ -79,6 +79,33 @@ def test_a_source_that_leaves_through_a_wall_changes_nothing_at_once():
     for each in (*np.log(share[:4]), closed, walls, thin / WALL_M):
         assert np.max(np.abs(np.diff(each))) < 0.02
     assert (closed[0], walls[0], closed[-1], walls[-1]) == (1.0, 1.0, 0.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("half", "wall", "start", "end", "axis"),
+    [
+        # across the middle plane of a block, far outside it
+        ((2.8402, 5.1625, 0.6533), 0.0, (3.1311, -1.2563, 0.0), (-4.039, 9.77, 5.204), 2),
+        # in a wall, nearly along its inner face: the inside lies far ahead of the line or far behind it
+        ((0.3008, 0.3309, 0.8084), 0.1643, (0.234, -0.4378, 3.1829), (0.234, 0.919, -1.845), 0),
+    ],
+)
+def test_a_plane_that_a_source_crosses_outside_changes_nothing_at_once(half, wall, start, end, axis):
+    place = np.tile(np.array(start), (4001, 1))
+    place[:, axis] += np.linspace(-0.02, 0.02, 4001)
+    share, _, _, _ = shares(place, end, half, wall)
+    assert np.max(np.abs(np.diff(np.log(share[:4])))) < 0.02
+
+
+def test_walls_that_meet_in_the_middle_are_a_block():
+    rng = np.random.default_rng(3)
+    half, start = rng.uniform(0.1, 3.0, (200, 3)), rng.normal(0.0, 1.0, (200, 3))
+    start, end = (d / np.linalg.norm(d, axis=1)[:, None] * 8.0 for d in (start, rng.normal(0.0, 1.0, (200, 3))))
+    block = shares(start, end, half, 0.0)
+    for times in (1.0, 1.05, 5.0):
+        walls = np.float32(times * half.min(axis=1))
+        for found, expected in zip(shares(start, end, half, walls), block, strict=True):
+            np.testing.assert_array_equal(found, expected)
 
 
 def test_smaller_walls_scatter_less():
