@@ -101,7 +101,7 @@ def deeper(rng: np.random.Generator, rows: Rows, n: int) -> Rows:
     growth, features = rows.growth[like], rows.features[like]
     times = np.exp(rng.uniform(*np.log(DEEPER), n))
     depth = np.minimum(rows.depth[like] * times, DEEPEST)
-    whole = depth * (1.0 + features[:, FEATURES.index("two")])
+    whole = depth * (1.0 + features[:, FEATURES.index("two")])  # of both walls
     return Rows(
         features=features, depth=depth, growth=growth, energy_kev=rows.energy_kev[like],
         direct=rows.direct[like] ** times, slab=whole * np.exp(growth - whole), counts=rows.counts[like],
@@ -112,7 +112,9 @@ def deeper(rng: np.random.Generator, rows: Rows, n: int) -> Rows:
 def deviations(net: Network, rows: Rows) -> jax.Array:
     """ln of model over Monte Carlo [n]."""
     of = outputs(rows.features.T, net).T
-    ln_share, _, _ = log_share(of, rows.depth[:, None], rows.energy_kev[:, None], rows.growth[:, None], net.lines)
+    walls = 1.0 + rows.features[:, FEATURES.index("two")]
+    lines = (x[:, None] for x in (rows.depth, rows.energy_kev, rows.growth, walls))
+    ln_share, _, _ = log_share(of, *lines, net.lines)
     return jnp.log((rows.direct + rows.slab * jnp.exp(ln_share[:, 0]) + NOTHING) / rows.counts)
 
 

@@ -88,8 +88,10 @@ def scattered_counts(
         by_depth = falling * (rising + (1.0 - of_walls) * mixed)
         return Scattered(layers, depth, slant_layers, slant, depth * falling, by_depth, falling * mixed)
     lines = (net or network()).lines
-    at_walls = depth * of_walls / way.shape.walls[..., None]
-    ln_share, by_ln_depth, by_growth = log_share(way.shape.scattered, at_walls, energy_kev, growth, lines)
+    walls = way.shape.walls[..., None]
+    ln_share, by_ln_depth, by_growth = log_share(
+        way.shape.scattered, depth * of_walls / walls, energy_kev, growth, walls, lines
+    )  # fmt: skip
     highest = float(np.log(MOST)) + depth - jnp.log(depth + 1e-9) - growth
     free = ln_share < highest
     by_ln_depth, by_growth = jnp.where(free, by_ln_depth, depth - 1.0), jnp.where(free, by_growth, -1.0)
@@ -105,11 +107,12 @@ def scattered_counts(
 
 
 def log_share(
-    scattered: jax.Array, depth: jax.Array, energy_kev: jax.Array, growth: jax.Array, lines: Array
+    scattered: jax.Array, depth: jax.Array, energy_kev: jax.Array, growth: jax.Array, walls: jax.Array, lines: Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """ln P [..., L] of a wall with ``depth`` [..., L], and its derivatives by ln(depth) and by the growth.
 
-    ``scattered`` [..., OUTPUTS] are the coefficients, ``lines`` the range of `Network`.
+    ``scattered`` [..., OUTPUTS] are the coefficients, ``walls`` [..., 1] how many are crossed in turn, ``lines`` the
+    range of `Network`. Beyond the last depth but one, which few cases are, deeper walls let no more pass.
     """
     lowest, highest, least, most = (jnp.asarray(x) for x in lines)
     level = jnp.clip(jnp.log(jnp.maximum(energy_kev, 1.0) / REFERENCE_KEV), lowest, highest)
@@ -127,4 +130,11 @@ def log_share(
         found = found + change * part
         by_growth = by_growth + (by[number + 1] - by[number]) * part
         by_depth += jnp.where((part > 0.0) & (part < 1.0), change / step, 0.0)
-    return found, by_depth, by_growth * within
+    deepest = DEPTHS[-2]
+    highest = logs[-2] + walls * (depth - deepest) - jnp.log(jnp.maximum(depth, deepest) / deepest)
+    free = (depth <= deepest) | (found < highest)
+    return (
+        jnp.where(free, found, highest),
+        jnp.where(free, by_depth, walls * depth - 1.0),
+        jnp.where(free, by_growth, by[-2]) * within,
+    )
