@@ -14,7 +14,7 @@ from swarmsim.radiation.walls import REFERENCE_KEV, log_share
 from swarmsim.site.surfaces import FEATURES, Box, surroundings
 from swarmsim.site.wall_network import COEFFICIENTS, OUTPUTS, Network, outputs
 
-UNITS = (40, 40)
+UNITS = (40, 40)  # of the hidden layers
 BATCH = 2048
 AT_ONCE = 1000  # steps
 RATE = 4e-3  # of the first step; it falls to nothing like a cosine
@@ -31,6 +31,7 @@ EDGE_ERROR = 0.04
 DEEP = 0.15  # cases with deeper matter, over all others
 DEEPER = (1.5, 6.0)  # so many times
 DEEPEST = 40.0  # mean free paths
+UNBOUNDED = 1e3  # walls in turn, of which no table says that too much passes
 NOTHING = 1e-7  # counts, whose logarithm is a number
 
 
@@ -96,7 +97,7 @@ def within(rng: np.random.Generator, rows: Rows, lines: Floats) -> Rows:
 
 
 def deeper(rng: np.random.Generator, rows: Rows, n: int) -> Rows:
-    """``n`` of the cases with the matter 1.5 to 6 times as deep: no more than before comes through any of it."""
+    """``n`` of the cases with the matter so many times as deep as `DEEPER` says: no more than before comes through it."""
     like = rng.integers(0, len(rows.depth), n)
     growth, features = rows.growth[like], rows.features[like]
     times = np.exp(rng.uniform(*np.log(DEEPER), n))
@@ -110,11 +111,10 @@ def deeper(rng: np.random.Generator, rows: Rows, n: int) -> Rows:
 
 
 def deviations(net: Network, rows: Rows) -> jax.Array:
-    """ln of model over Monte Carlo [n]."""
+    """ln of model over Monte Carlo [n], without the bound of deep walls: what it holds back would never be mended."""
     of = outputs(rows.features.T, net).T
-    walls = 1.0 + rows.features[:, FEATURES.index("two")]
-    lines = (x[:, None] for x in (rows.depth, rows.energy_kev, rows.growth, walls))
-    ln_share, _, _ = log_share(of, *lines, net.lines)
+    lines = (x[:, None] for x in (rows.depth, rows.energy_kev, rows.growth))
+    ln_share, _, _ = log_share(of, *lines, jnp.asarray(UNBOUNDED), net.lines)
     return jnp.log((rows.direct + rows.slab * jnp.exp(ln_share[:, 0]) + NOTHING) / rows.counts)
 
 

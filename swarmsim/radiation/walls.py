@@ -4,8 +4,9 @@ The tables of `swarmsim.radiation.scattering` hold for a slab of infinite width 
 with the depth t the short way through, P S(t) photons arrive, S(t) = t exp(g(t) - t) those of the slab. ln P has, for
 the size, the shape and the place of the walls, coefficients at depths of t / n for n walls in turn
 (`swarmsim.site.wall_network`): of 1, of the energy's logarithm, and of the growth g, which tells how much the material
-absorbs. It is linear in ln(t) between those depths and constant beyond. A wide wall that is crossed squarely is the
-slab: ln P = 0.
+absorbs. It is linear in ln(t) between those depths and constant beyond, but such that walls deeper than the last depth
+but one let no more pass with the same growth, and that no more than `MOST` times the counts of the bare source arrive.
+A wide wall that is crossed squarely is the slab: ln P = 0.
 """
 
 from typing import NamedTuple

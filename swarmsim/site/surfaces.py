@@ -62,6 +62,7 @@ _LEAST_SEEN = 0.02
 _LEAST_SLANT = 0.15
 _LEAST_RATIO = 3e-3
 _LEAST_THIN = 0.01
+_LEAST_AWAY = 0.01  # of the box's size: a source that touches a face must not count by tenths of a millimetre
 
 
 class Box(NamedTuple):
@@ -191,7 +192,7 @@ def surroundings(box: Box) -> Surroundings:
         between,
         first,
         _log(detector / jnp.maximum(distance, _LEAST_M), _LEAST_RATIO),
-        *(_log(x / size, _LEAST_RATIO) for x in (detector, source)),
+        *(_log(x / size, _LEAST_AWAY) for x in (detector, source)),
         *(jnp.maximum(-most(_beyond(x, box.half)) / size, -1.0) for x in (box.start, box.end)),
         jnp.where(hollow, walls - 1.0, 0.0),
         jnp.where(hollow, 1.0, 0.0),

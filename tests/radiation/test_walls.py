@@ -108,12 +108,38 @@ def test_the_share_changes_with_the_energy_and_the_growth(detectors: Detectors) 
         assert np.log(found / slab) == pytest.approx(expected, abs=2e-3)
 
 
-def test_derivatives_by_the_thickness_are_those_of_the_counts(detectors: Detectors) -> None:
+DEEP = np.exp([0.0, 0.0, 0.0, 0.0, 30.0])  # far more from the deepest walls than from thinner ones
+
+
+@pytest.mark.parametrize("walls", [1.0, 2.0])
+def test_deeper_walls_let_no_more_pass(detectors: Detectors, walls: float) -> None:
+    """Whatever the last depth of a table says; from the last but one on, as the slab's counts fall."""
+    d, line = detectors["nai_2x2", "physical"], 3
+    mu = float(through(d, steel=1.0).length_m @ d.attenuation_1_m[d.nuclide_names.index("Cs-137"), line])
+    ways = [through(d, steel=t * walls / mu) for t in np.linspace(DEPTHS[-2], DEPTHS[-1], 30)]
+    found = [scattered(d, shaped(way, share=DEEP, walls=walls))[line] for way in ways]
+    slab = scattered(d, ways[0])[line]
+    assert found[0] == pytest.approx(slab, rel=1e-3)
+    assert np.max(found) < 1.3 * slab  # the growth still rises a little
+    np.testing.assert_allclose(found[-1], slab, rtol=0.3)
+
+
+@pytest.mark.parametrize(
+    ("share", "thicknesses", "walls"),
+    [
+        (np.array([0.5, 0.4, 0.8, 0.2, 0.3]), (0.05, 0.11, 0.25), 1.0),
+        (DEEP, (0.5, 0.7), 1.0),  # bounded by what the last depth but one lets pass,
+        (DEEP, (0.9,), 2.0),
+        (1e12, (0.1, 0.3), 1.0),  # and by the bare source
+    ],
+)
+def test_derivatives_by_the_thickness_are_those_of_the_counts(
+    detectors: Detectors, share: float | np.ndarray, thicknesses: tuple[float, ...], walls: float
+) -> None:
     """Of walls whose share changes with depth, energy and growth: against differences."""
-    d, share = detectors["nai_2x2", "physical"], np.array([0.5, 0.4, 0.8, 0.2, 0.3])
-    concrete = d.material_names.index("concrete")
-    for metres in (0.05, 0.11, 0.25):
-        way = shaped(through(d, concrete=metres), share=share, by=(0.3, -0.2))
+    d, concrete = detectors["nai_2x2", "physical"], detectors["nai_2x2", "physical"].material_names.index("concrete")
+    for metres in thicknesses:
+        way = shaped(through(d, concrete=metres), share=share, walls=walls, by=(0.3, -0.2))
         more = [stretched(way, jnp.ones(len(d.material_names)).at[concrete].set(f)) for f in (0.99, 1.01)]
         places, axes = PLACE[None], UP[None]
         one = lambda w: jax.tree.map(lambda x: x[None], w)  # noqa: E731
