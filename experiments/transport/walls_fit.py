@@ -97,7 +97,7 @@ def within(rng: np.random.Generator, rows: Rows, lines: Floats) -> Rows:
 
 
 def deeper(rng: np.random.Generator, rows: Rows, n: int) -> Rows:
-    """``n`` of the cases with the matter so many times as deep as `DEEPER` says: no more than before comes through it."""
+    """``n`` of the cases with the matter `DEEPER` times as deep: no more than before comes through it."""
     like = rng.integers(0, len(rows.depth), n)
     growth, features = rows.growth[like], rows.features[like]
     times = np.exp(rng.uniform(*np.log(DEEPER), n))

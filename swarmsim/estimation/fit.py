@@ -92,6 +92,7 @@ def settle(
     return _settled(problem, linear(u, source), u, ways, source)
 
 
+@jax.jit  # traced once for all places of a program that call it
 def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, source: Rates) -> Settled:
     at = normal_equations(problem, model, u)
     height = ways.position_m[2] - sample(problem.site.terrain_m, problem.site, ways.position_m[:2])
@@ -116,6 +117,7 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
     )
 
 
+@jax.jit  # traced once for all places of a program that call it
 def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Unknowns:
     """Where a fit at a new place starts: the activity, and each window's background and gain, all else as in ``u``.
 

@@ -140,6 +140,7 @@ def inverse_square_gain(offset_m: jax.Array, pieces_m: jax.Array, rays: int) -> 
     return jnp.sum(offset_m * offset_m, axis=-1) * mean
 
 
+@jax.jit  # traced once for all places of a program that call it
 def ways_from(problem: Problem, place: jax.Array) -> Ways:
     """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
     position, valid = position_of(problem.site, place), problem.measurements.valid
@@ -155,6 +156,7 @@ def ways_from(problem: Problem, place: jax.Array) -> Ways:
     return Ways(crossed=crossed, position_m=position)
 
 
+@jax.jit  # traced once for all places of a program that call it
 def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) -> Rates:
     """Counts per Bq of a source of ``nuclide``.
 

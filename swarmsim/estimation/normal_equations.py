@@ -70,6 +70,7 @@ class Linearised:
     registered: jax.Array  # [n] derivative of the registered counts of a window by the true ones
 
 
+@jax.jit  # traced once for all places of a program that call it
 def linearised(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Linearised:
     """The model at ``u``, with the rates of the source at ``where`` [3]."""
     gain = jnp.exp(u.gain)[:, None]
@@ -154,6 +155,7 @@ class NormalEquations:
     fitted: jax.Array  # [] how many of them the data determine
 
 
+@jax.jit  # traced once for all places of a program that call it
 def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> NormalEquations:
     """The normal equations at ``u``, where ``model`` is linearised."""
     m = problem.measurements
