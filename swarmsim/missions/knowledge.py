@@ -26,7 +26,7 @@ from swarmsim.radiation.background import background_factor
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
 from swarmsim.radiation.poisson import poisson
-from swarmsim.radiation.rate import spectrum_rate
+from swarmsim.radiation.rate import mean_view, spectrum_rate
 from swarmsim.sensors.radiation import length_factors, sensitivity_factor
 from swarmsim.site import crossed
 from swarmsim.site.rays import stretched
@@ -136,7 +136,11 @@ def named(
     assert plan.presumed is not None
     measurements, _ = gathered(world, plan, windows, key)
     spectrum = _spectrum(key, world, plan, known, measurements, trail)
-    identification = identify(plan.detectors[plan.spectrometer], spectrum.counts, spectrum.live_s)
+    detector = plan.detectors[plan.spectrometer]
+    used = _near_source(plan, known, measurements)
+    offset = known.estimated.fits.position_m[0] - measurements.position_m
+    view = mean_view(detector, offset, measurements.axis, jnp.where(used, measurements.exposure_s, 0.0))
+    identification = identify(detector, spectrum.counts, spectrum.live_s, view)
     state = known.estimated.state
     inside = jnp.asarray(plan.presumed.nuclides)[jnp.maximum(identification.nuclide, 0)]
     sure = (identification.confidence >= plan.confidence_min) & (identification.nuclide >= 0) & inside
@@ -150,10 +154,15 @@ def _spectrum(
     key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements, trail: Trail | None
 ) -> Accumulated:
     """The spectrum taken by the spectrometer within its radius of the first source."""
+    used = _near_source(plan, known, measurements)
+    return accumulate_spectrum(key, world, plan.spectrometer, measurements, used, trail)
+
+
+def _near_source(plan: Plan, known: Survey, measurements: Measurements) -> jax.Array:
+    """Whether each measurement [n] is the spectrometer's, within its radius of the first source."""
     apart = measurements.position_m[:, :2] - known.estimated.fits.position_m[0, :2]
     near = jnp.sqrt(jnp.sum(apart * apart, axis=-1)) < plan.spectrum_radius_m
-    used = near & measurements.valid & (measurements.detector == plan.spectrometer) & known.found
-    return accumulate_spectrum(key, world, plan.spectrometer, measurements, used, trail)
+    return near & measurements.valid & (measurements.detector == plan.spectrometer) & known.found
 
 
 def accumulate_spectrum(

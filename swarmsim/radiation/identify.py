@@ -94,8 +94,11 @@ class _Strangers(NamedTuple):
     share: jax.Array  # [] of the evidence of the former that is its own
 
 
-def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identification:
+def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax.Array | None = None) -> Identification:
     """Identify the nuclides in ``counts`` [channels] accumulated over ``live_s`` [] seconds.
+
+    ``view`` is how the crystal saw the source (`swarmsim.radiation.rate.mean_view`), by default from far away, end on:
+    from the side or close by, soft photons count more than hard ones.
 
     With no counts or no live time the posterior is the prior. Only nuclides for which the detector has tables are
     named, and at most three at once. Raises `InputError` for a detector without energy resolution.
@@ -103,7 +106,7 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Identi
     if not detector.identification_bins:
         raise InputError.of("a counter without energy resolution tells no nuclides apart: use a scintillator")
     n = len(detector.nuclide_names)
-    table, data = tables(detector), binned_data(detector, counts, live_s)
+    table, data = tables(detector, view), binned_data(detector, counts, live_s)
     strangers = _strangers(detector, table, data)
     stages = _stages(table, data, jnp.asarray(np.log(shield_shares(detector)), jnp.float32), n)
     prior = (

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.radiation.cylinder import direction_basis, near_ratio
+from swarmsim.radiation.cylinder import NEAR_TABLES, direction_basis, near_ratio
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.lines import SPECTRUM_DEPTHS
 from swarmsim.radiation.poisson import poisson
@@ -92,18 +92,43 @@ def _scattered(detector: Detector, nuclide: jax.Array, way: Crossed) -> Scattere
 
 def _seen(detector: Detector, source: Source, position_m: jax.Array, axis: jax.Array) -> jax.Array:
     """Counts per second of each line [L] without attenuation."""
-    offset = source.position_m - position_m
-    squared = jnp.sum(offset * offset)
+    basis, near, squared = _view(detector, source.position_m - position_m, axis)
+    area = detector.effective_area_m2[source.nuclide] @ basis
+    geometry = (detector.near_share[source.nuclide] @ near) / (4.0 * jnp.pi * squared)
+    return source.activity_bq * geometry * detector.yields[source.nuclide] * area
+
+
+def _view(detector: Detector, offset_m: jax.Array, axis: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """How a crystal sees a source ``offset_m`` [3] away: direction [5], near-field ratios [NEAR_TABLES], r^2 + S^2."""
+    squared = jnp.sum(offset_m * offset_m)
     distance = jnp.sqrt(squared + 1e-12)
-    u = jnp.abs(jnp.dot(offset, axis)) / distance
-    across = jnp.cross(offset, axis) / distance
+    u = jnp.abs(jnp.dot(offset_m, axis)) / distance
+    across = jnp.cross(offset_m, axis) / distance
     # the gradient is finite on the axis, and in the crystal's centre it is seen from the side
     s = jnp.sqrt(jnp.sum(across * across) + 1e-10 + 1e-12 / (squared + 1e-12))
     reach2 = detector.radius_m**2 + 0.25 * detector.length_m**2
-    near = near_ratio(detector.near, distance / jnp.sqrt(reach2), u, s)
-    area = detector.effective_area_m2[source.nuclide] @ direction_basis(u, s)
-    geometry = (detector.near_share[source.nuclide] @ near) / (4.0 * jnp.pi * (squared + reach2))
-    return source.activity_bq * geometry * detector.yields[source.nuclide] * area
+    return direction_basis(u, s), near_ratio(detector.near, distance / jnp.sqrt(reach2), u, s), squared + reach2
+
+
+def mean_view(detector: Detector, offset_m: jax.Array, axis: jax.Array, weight: jax.Array) -> jax.Array:
+    """How a crystal sees a source on its way [5, NEAR_TABLES]: by direction and nearness, for `identify`.
+
+    Args:
+        detector: the crystal.
+        offset_m: [n, 3] from the places on the way to the source.
+        axis: [n, 3] of the crystal there.
+        weight: [n] how long it was there; with none at all it is seen `end_on`.
+    """
+    basis, near, squared = jax.vmap(lambda offset, along: _view(detector, offset, along))(offset_m, axis)
+    share = weight / squared
+    total = jnp.sum(share)
+    seen = jnp.einsum("n,nb,nk->bk", share / jnp.maximum(total, 1e-30), basis, near)
+    return jnp.where(total > 0.0, seen, end_on())
+
+
+def end_on() -> jax.Array:
+    """The `mean_view` of a distant source on the crystal's axis."""
+    return direction_basis(jnp.float32(1.0), jnp.float32(0.0))[:, None] * jnp.ones(NEAR_TABLES)
 
 
 def net_rate(

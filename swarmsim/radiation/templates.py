@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmsim.radiation.cylinder import direction_basis
 from swarmsim.radiation.detector import AIR, Detector
 from swarmsim.radiation.lines import DEPTHS, GROUND, SHIELDS
-from swarmsim.radiation.rate import from_ground, scattered_shares, transmission
+from swarmsim.radiation.rate import end_on, from_ground, scattered_shares, transmission
 from swarmsim.radiation.strangers import shield_count
 from swarmsim.site.rays import Crossed, wide
 
@@ -62,16 +61,16 @@ def stranger_shares(detector: Detector) -> NDArray[np.float64]:
     return np.asarray(share / share.sum())
 
 
-def tables(detector: Detector) -> Tables:
-    """Spectra of every nuclide of a detector with energy resolution behind every shield."""
+def tables(detector: Detector, view: jax.Array | None = None) -> Tables:
+    """Spectra of every nuclide of a detector with energy resolution behind every shield, in a `mean_view`."""
     names, n = detector.material_names, len(detector.nuclide_names)
     is_air = jnp.array([name == AIR for name in names])
 
     def behind(number: jax.Array, layer: jax.Array) -> tuple[jax.Array, jax.Array]:
         wall = layer[0].astype(jnp.int32)
-        thickness = thickness_m(detector, number, wall, layer[1])
+        thickness = thickness_m(detector, number, wall, layer[1], view)
         length_m = thickness * (jnp.arange(len(names)) == wall) + layer[2] * is_air
-        return _counts(detector, number, length_m, 0.5, layer[3])
+        return _counts(detector, number, length_m, 0.5, layer[3], view)
 
     layers = jnp.asarray(shields(detector), jnp.float32)
     direct, bins = jax.vmap(lambda k: jax.vmap(lambda layer: behind(k, layer))(layers))(jnp.arange(n))
@@ -91,16 +90,22 @@ def tables(detector: Detector) -> Tables:
 
 
 def _counts(
-    detector: Detector, nuclide: jax.Array, length_m: jax.Array, place: jax.Array | float, above: jax.Array | float
+    detector: Detector,
+    nuclide: jax.Array,
+    length_m: jax.Array,
+    place: jax.Array | float,
+    above: jax.Array | float,
+    view: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts of unscattered photons by line [L] and of scattered ones by bin, of a nuclide end on, up to one factor.
+    """Counts of unscattered photons by line [L] and of scattered ones by bin, of a nuclide, up to one factor.
 
     The way crosses ``length_m`` [M] of each material, whose middle is at ``place`` [] between source (0) and detector.
-    ``above`` [] is 1 where the ground shines as much as it can, 0 without a ground.
+    ``above`` [] is 1 where the ground shines as much as it can, 0 without a ground. ``view`` [5, NEAR_TABLES] is the
+    `mean_view` of the crystal, by default end on.
     """
     places, ground = jnp.full(len(detector.material_names), place), jnp.full(2, above)
     way = Crossed(length_m=length_m, place=places, shape=wide(length_m, ground))
-    lines = _bare_lines(detector, nuclide)
+    lines = _bare_lines(detector, nuclide, view)
     direct, scattered = transmission(detector, nuclide, way)
     of_ground = (lines * (direct + scattered) * from_ground(detector, nuclide, way)) @ detector.ground_bins[nuclide]
     return lines * direct, (lines * scattered) @ scattered_shares(detector, nuclide, way) + of_ground
@@ -121,9 +126,11 @@ def shielded(
     return direct @ detector.peak_spectrum[nuclide] + bins @ detector.bin_spectrum
 
 
-def thickness_m(detector: Detector, nuclide: jax.Array, material: jax.Array, depth: jax.Array) -> jax.Array:
+def thickness_m(
+    detector: Detector, nuclide: jax.Array, material: jax.Array, depth: jax.Array, view: jax.Array | None = None
+) -> jax.Array:
     """Thickness [] of a material that reduces the counts of unscattered photons of a nuclide to exp(-depth)."""
-    lines = _bare_lines(detector, nuclide)
+    lines = _bare_lines(detector, nuclide, view)
     attenuation = detector.attenuation_1_m[nuclide, :, material]
     share = lines / jnp.maximum(jnp.sum(lines), 1e-30)
 
@@ -138,7 +145,7 @@ def thickness_m(detector: Detector, nuclide: jax.Array, material: jax.Array, dep
     return jax.lax.scan(step, (jnp.zeros(()), high), None, length=_SEARCH_STEPS)[0][0]
 
 
-def _bare_lines(detector: Detector, nuclide: jax.Array) -> jax.Array:
-    """Counts [L] of each line without attenuation, end on, up to a factor."""
-    end_on = direction_basis(jnp.float32(1.0), jnp.float32(0.0))
-    return detector.yields[nuclide] * (detector.effective_area_m2[nuclide] @ end_on)
+def _bare_lines(detector: Detector, nuclide: jax.Array, view: jax.Array | None = None) -> jax.Array:
+    """Counts [L] of each line without attenuation, up to a factor."""
+    seen = detector.effective_area_m2[nuclide] @ (end_on() if view is None else view)  # [L, NEAR_TABLES]
+    return detector.yields[nuclide] * jnp.sum(seen * detector.near_share[nuclide], axis=1)

@@ -14,6 +14,7 @@ from swarmsim.radiation.goodness import p_value
 from swarmsim.radiation.identify import NONE, UNKNOWN, _present
 from swarmsim.radiation.laplace import COLUMNS, NATURAL, NATURAL_STD, Data, Hypothesis, laplace, swept
 from swarmsim.radiation.lines import GAINS, ORDERS, identification_bins, orders
+from swarmsim.radiation.rate import end_on, mean_view
 from swarmsim.radiation.response import build_response
 from swarmsim.radiation.templates import shielded, thickness_m
 from tests.radiation.points import MOUNT, point, through
@@ -23,6 +24,7 @@ LIVE_S = 60.0
 Detectors = dict[tuple[str, str], Detector]
 BATCH = 30
 _run = jax.jit(jax.vmap(identify, in_axes=(None, 0, None)))
+_viewed = jax.jit(identify)
 
 
 def test_certainty_is_no_more_than_one() -> None:
@@ -192,6 +194,39 @@ def test_a_stranger_is_unknown(library: Library) -> None:
         found = run(detector, np.random.default_rng(6).poisson(mean * live), live)
         assert list(found.nuclide) == expected
         assert np.all(found.confidence > 0.5)
+
+
+@pytest.mark.parametrize("nuclide", ["Ba-133", "Eu-152"])
+def test_a_source_close_by_and_from_the_side_fits(detectors: Detectors, nuclide: str) -> None:
+    """400,000 counts: X-rays count more over harder photons than end on, by up to a half. Far away, end on is right."""
+    detector = detectors["nai_2x2", "physical"]
+    offsets = jnp.array([[6.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.6, 0.0, 0.6], [0.0, 0.0, 50.0]])
+    source, live = point(detector, nuclide), 90.0
+    for number, offset in enumerate(offsets):
+        mean = np.asarray(spectrum_rate(detector, source, through(detector), source.position_m - offset, UP))
+        mean = mean * 4e5 / mean.sum() + np.asarray(detector.background_spectrum) * live
+        counts = np.random.default_rng(number).poisson(mean).astype(np.float32)
+        view = mean_view(detector, offset[None], UP[None], jnp.ones(1))
+        fits = _viewed(detector, counts, live, view)
+        assert detector.nuclide_names[int(fits.nuclide)] == nuclide
+        assert fits.goodness > 0.01
+        if number == 3:
+            np.testing.assert_allclose(view, end_on(), rtol=2e-3, atol=1e-4)
+        elif number == 2:
+            assert _viewed(detector, counts, live, end_on()).goodness < 1e-3
+
+
+def test_a_view_is_the_mean_over_the_way(detectors: Detectors) -> None:
+    """Weighted with the time and with 1 / (r^2 + S^2), which is how much of the spectrum each place adds."""
+    detector = detectors["nai_2x2", "physical"]
+    offsets, weight = jnp.array([[3.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.1, 0.2, 0.2]]), jnp.array([2.0, 1.0, 0.0])
+    axes = jnp.broadcast_to(UP, offsets.shape)
+    one = [mean_view(detector, offsets[k : k + 1], axes[:1], jnp.ones(1)) for k in range(2)]
+    reach2 = float(detector.radius_m**2 + 0.25 * detector.length_m**2)
+    share = np.array([2.0 / (9.0 + reach2), 1.0 / (1.0 + reach2)])
+    expected = (share[0] * one[0] + share[1] * one[1]) / share.sum()
+    np.testing.assert_allclose(mean_view(detector, offsets, axes, weight), expected, rtol=1e-5)
+    np.testing.assert_array_equal(mean_view(detector, offsets, axes, jnp.zeros(3)), end_on())
 
 
 def test_three_nuclides_are_named(detectors: Detectors) -> None:
