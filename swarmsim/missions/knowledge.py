@@ -135,9 +135,8 @@ def named(
     """
     assert plan.presumed is not None
     measurements, _ = gathered(world, plan, windows, key)
-    spectrum = _spectrum(key, world, plan, known, measurements, trail)
-    detector = plan.detectors[plan.spectrometer]
-    used = _near_source(plan, known, measurements)
+    used, detector = _near_source(plan, known, measurements), plan.detectors[plan.spectrometer]
+    spectrum = accumulate_spectrum(key, world, plan.spectrometer, measurements, used, trail)
     offset = known.estimated.fits.position_m[0] - measurements.position_m
     view = mean_view(detector, offset, measurements.axis, jnp.where(used, measurements.exposure_s, 0.0))
     identification = identify(detector, spectrum.counts, spectrum.live_s, view)
@@ -148,14 +147,6 @@ def named(
     first = jnp.where(sure & state.sources.present[0], identification.nuclide, nuclides[0])
     state = replace(state, sources=replace(state.sources, nuclide=nuclides.at[0].set(first)))
     return replace(known, estimated=replace(known.estimated, state=state)), spectrum, identification
-
-
-def _spectrum(
-    key: jax.Array, world: World, plan: Plan, known: Survey, measurements: Measurements, trail: Trail | None
-) -> Accumulated:
-    """The spectrum taken by the spectrometer within its radius of the first source."""
-    used = _near_source(plan, known, measurements)
-    return accumulate_spectrum(key, world, plan.spectrometer, measurements, used, trail)
 
 
 def _near_source(plan: Plan, known: Survey, measurements: Measurements) -> jax.Array:

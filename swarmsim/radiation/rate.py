@@ -117,8 +117,9 @@ def mean_view(detector: Detector, offset_m: jax.Array, axis: jax.Array, weight: 
         detector: the crystal.
         offset_m: [n, 3] from the places on the way to the source.
         axis: [n, 3] of the crystal there.
-        weight: [n] how long it was there; with none at all it is seen `end_on`.
+        weight: [n] how long it was there; rows without any may hold anything. With none at all it is seen `end_on`.
     """
+    offset_m, axis = (jnp.where(weight[:, None] > 0.0, x, 1.0) for x in (offset_m, axis))
     basis, near, squared = jax.vmap(lambda offset, along: _view(detector, offset, along))(offset_m, axis)
     share = weight / squared
     total = jnp.sum(share)

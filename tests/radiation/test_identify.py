@@ -227,6 +227,8 @@ def test_a_view_is_the_mean_over_the_way(detectors: Detectors) -> None:
     expected = (share[0] * one[0] + share[1] * one[1]) / share.sum()
     np.testing.assert_allclose(mean_view(detector, offsets, axes, weight), expected, rtol=1e-5)
     np.testing.assert_array_equal(mean_view(detector, offsets, axes, jnp.zeros(3)), end_on())
+    padded = mean_view(detector, offsets.at[2].set(jnp.nan), axes.at[2].set(jnp.inf), weight)
+    np.testing.assert_allclose(padded, expected, rtol=1e-5)
 
 
 def test_three_nuclides_are_named(detectors: Detectors) -> None:

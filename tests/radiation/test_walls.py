@@ -128,7 +128,7 @@ def test_deeper_walls_let_no_more_pass(detectors: Detectors, walls: float) -> No
     ("share", "thicknesses", "walls"),
     [
         (np.array([0.5, 0.4, 0.8, 0.2, 0.3]), (0.05, 0.11, 0.25), 1.0),
-        (DEEP, (0.5, 0.7), 1.0),  # bounded by what the last depth but one lets pass,
+        (DEEP, (0.5, 0.7), 1.0),  # bounded by what the last depth but one lets pass
         (DEEP, (0.9,), 2.0),
         (1e12, (0.1, 0.3), 1.0),  # and by the bare source
     ],
