@@ -12,9 +12,13 @@ What belongs to one window is eliminated there (Schur complement), so that the c
 their square.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from swarmsim.device import on_processor
 from swarmsim.estimation.forward import Problem, Rates, dead_time, detector_of, variance_of
 from swarmsim.estimation.likelihood import poisson_log_likelihood, scaled_inverse
 from swarmsim.pytree import pytree
@@ -60,71 +64,69 @@ def nothing_known(problem: Problem, sources: int) -> Unknowns:
 
 @pytree
 class Linearised:
-    """Means, and how they change with the unknowns."""
+    """Means, and how they change with the unknowns. Windows come last, so that several are computed at a time.
 
-    mean: jax.Array  # [n, R]
-    common: jax.Array  # [n, R, P] by ln(activity), the others' factors (logarithms), levels, lengths
-    own: jax.Array  # [n, R, 2] by the window's background and gain
-    moved: jax.Array  # [n, R, 3] by the place
-    variance: jax.Array  # [n, 2] of the priors of the window's own unknowns, background and gain
+    The B = 1 + K + 1 + U columns are those of ln(activity), of the logarithms of the others' factors, of the logarithm
+    of all background, and of lengths: the unknowns that windows share, and a window's own, act through these.
+    """
+
+    mean: jax.Array  # [R, n]
+    columns: jax.Array  # [B, R, n]
+    nearer: jax.Array  # [3, n] change of ln(rate of the source) with its place
+    variance: jax.Array  # [2, n] of the priors of a window's own unknowns, background and gain
     registered: jax.Array  # [n] derivative of the registered counts of a window by the true ones
 
 
 @jax.jit  # traced once for all places of a program that call it
 def linearised(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Linearised:
     """The model at ``u``, with the rates of the source at ``where`` [3]."""
-    gain = jnp.exp(u.gain)[:, None]
-    own = u.activity_bq * source.counts * gain
-    rest = others.counts * u.others[:, None, None] * gain  # [K, n, R]
-    signal = own + jnp.sum(rest, axis=0)
-    models = detector_of(problem)
-    background = problem.background * jnp.exp(models @ u.level + u.background)[:, None]
-    true = signal + background
-    total = jnp.sum(true, axis=1)
+    gain = jnp.exp(u.gain)
+    own = u.activity_bq * source.counts.T * gain
+    rest = jnp.swapaxes(others.counts, 1, 2) * u.others[:, None, None] * gain  # [K, R, n]
+    background = problem.background.T * jnp.exp(u.level @ detector_of(problem).T + u.background)
+    by_lengths = u.activity_bq * jnp.moveaxis(source.slopes, 0, 2) * gain
+    added = jnp.concatenate([own[None], rest, background[None], by_lengths])
+    true = own + jnp.sum(rest, axis=0) + background
+    total = jnp.sum(true, axis=0)
     share, fall = dead_time(problem, total)
-
-    def seen(change: jax.Array) -> jax.Array:
-        """Change [n, R, p] of what is registered from that of the true counts."""
-        sums = jnp.sum(change, axis=1, keepdims=True)
-        return share[:, None, None] * change + true[..., None] * (fall[:, None] * sums[:, 0])[:, None]
-
-    by_lengths = jnp.moveaxis(u.activity_bq * source.slopes, 1, 2) * gain[..., None]
-    by_level = background[..., None] * models[:, None]
-    common = jnp.concatenate([own[..., None], jnp.moveaxis(rest, 0, 2), by_level, by_lengths], axis=-1)
     offset = where - problem.measurements.position_m
     squared = jnp.maximum(jnp.sum(offset * offset, axis=-1, keepdims=True), 0.01)
-    moved = own[..., None] * (-2.0 * offset / squared)[:, None]
     return Linearised(
-        mean=share[:, None] * true,
-        common=seen(common),
-        own=seen(jnp.stack([background, signal], axis=-1)),
-        moved=seen(moved),
+        mean=share * true,
+        # what is registered of a change of the true counts
+        columns=share * added + true * (fall * jnp.sum(added, axis=1))[:, None],
+        nearer=(-2.0 * offset / squared).T,
         registered=share + fall * total,
-        variance=_variance(problem, jnp.sum(own, axis=1), jnp.sum(rest, axis=2), others, where, source.edge),
+        variance=_variance(problem, jnp.sum(own, axis=0), jnp.sum(rest, axis=1), others, where, source.edge),
     )
+
+
+def of_window(columns: jax.Array, sources: int) -> jax.Array:
+    """Columns [2, ...] of a window's background and gain, from all [B, ...] with so many other ``sources``."""
+    return jnp.stack([columns[1 + sources], jnp.sum(columns[: 1 + sources], axis=0)])
 
 
 def _variance(
     problem: Problem, own: jax.Array, rest: jax.Array, others: Others, where: jax.Array, edge: jax.Array
 ) -> jax.Array:
-    """Variances [n, 2] of a window's own unknowns; a gain stands for all sources, weighted with what they add."""
+    """Variances [2, n] of a window's own unknowns; a gain stands for all sources, weighted with what they add."""
     total = own + jnp.sum(rest, axis=0)
     varied = own * (variance_of(problem, where) + edge) + jnp.sum(rest * others.variance, axis=0)
     model = jnp.square(problem.model_std)
     variance = jnp.where(total > 0.0, varied / jnp.maximum(total, 1e-20), model)
     background = jnp.broadcast_to(jnp.square(problem.background_std), variance.shape)
-    return jnp.clip(jnp.stack([background, variance], axis=-1), 1e-6, 1.0)
+    return jnp.clip(jnp.stack([background, variance]), 1e-6, 1.0)
 
 
 def _own_precision(problem: Problem, variance: jax.Array, u: Unknowns) -> jax.Array:
-    """Precisions [n, 2] of the priors of a window's own unknowns at ``u``, from their variances.
+    """Precisions [2, n] of the priors of a window's own unknowns at ``u``, from their variances.
 
     The gain has Student's t-distribution: its precision is that of the normal distribution with the same slope at ``u``
     (iteratively reweighted least squares: Lange, Little and Taylor, JASA 84, 1989, 881).
     """
     tail = problem.tail
-    heavy = (tail + 1.0) / (tail * variance[:, 1] + jnp.square(u.gain))
-    return jnp.stack([1.0 / variance[:, 0], heavy], axis=-1)
+    heavy = (tail + 1.0) / (tail * variance[1] + jnp.square(u.gain))
+    return jnp.stack([1.0 / variance[0], heavy])
 
 
 def prior_precision(problem: Problem, sources: int) -> jax.Array:
@@ -142,13 +144,13 @@ def _common(u: Unknowns) -> jax.Array:
 
 @pytree
 class NormalEquations:
-    """Normal equations at some unknowns."""
+    """Normal equations at some unknowns; windows come last."""
 
     information: jax.Array  # [P, P] the windows' own unknowns eliminated, priors included
     push: jax.Array  # [P]
-    own: jax.Array  # [n, 2, 2] inverse of the information about a window's own unknowns
-    crossing: jax.Array  # [n, 2, P]
-    own_push: jax.Array  # [n, 2]
+    own: jax.Array  # [2, 2, n] inverse of the information about a window's own unknowns
+    crossing: jax.Array  # [2, B, n] of those with the columns of `Linearised`
+    own_push: jax.Array  # [2, n]
     towards: jax.Array  # [3, 3]
     pull: jax.Array  # [3] derivative by the place, the unknowns marginalised
     log_volume: jax.Array  # [] of the windows' own unknowns, over that of their priors
@@ -158,58 +160,85 @@ class NormalEquations:
 @jax.jit  # traced once for all places of a program that call it
 def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> NormalEquations:
     """The normal equations at ``u``, where ``model`` is linearised."""
-    m = problem.measurements
+    m, k = problem.measurements, u.others.shape[0]
     assert m.rois is not None
-    weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
-    left = weight * (m.rois - model.mean)
-    common_precision = prior_precision(problem, u.others.shape[0])
-    own_precision = _own_precision(problem, model.variance, u)
-    nuisance = window_unknowns(u)
-    columns = jnp.concatenate([model.common, model.moved], axis=-1)
-    # products of a few numbers for each window are written as sums: a batched matrix product would be slower
-    weighted = model.own * weight[..., None]
-    h = jnp.sum(weighted[..., :, None] * model.own[..., None, :], axis=1) + own_precision[:, :, None] * jnp.eye(2)
-    determinant = h[:, 0, 0] * h[:, 1, 1] - h[:, 0, 1] * h[:, 1, 0]
-    flipped = jnp.stack([jnp.stack([h[:, 1, 1], -h[:, 0, 1]], -1), jnp.stack([-h[:, 1, 0], h[:, 0, 0]], -1)], axis=-2)
-    own = flipped / determinant[:, None, None]
-    crossing = jnp.stack([jnp.sum(weighted[..., a, None] * columns, axis=1) for a in range(2)], axis=1)
-    own_push = jnp.einsum("nrp,nr->np", model.own, left) - own_precision * nuisance
-    p = columns.shape[-1]
-    whole = (columns * weight[..., None]).reshape(-1, p).T @ columns.reshape(-1, p)
-    turned = jnp.sum(own[..., None] * crossing[:, None], axis=2)  # [n, 2, P]
-    whole = whole - turned.reshape(-1, p).T @ crossing.reshape(-1, p)
-    push = jnp.einsum("nrp,nr->p", columns, left) - jnp.sum(turned * own_push[..., None], axis=(0, 1))
+    columns = model.columns
+    weight = jnp.where(m.valid, problem.trust.T / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
+    left = weight * (m.rois.T - model.mean)
+    products, pushes = _products(columns * weight, columns), jnp.sum(columns * left, axis=1)
+    crossing = of_window(products, k)
+    precision = _own_precision(problem, model.variance, u)
+    h = of_window(jnp.swapaxes(crossing, 0, 1), k) + precision[:, None] * jnp.eye(2)[..., None]
+    determinant = h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0]
+    own = jnp.stack([jnp.stack([h[1, 1], -h[0, 1]]), jnp.stack([-h[1, 0], h[0, 0]])]) / determinant
+    own_push = of_window(pushes, k) - precision * window_unknowns(u)
+    turned = own[:, 0, None] * crossing[0] + own[:, 1, None] * crossing[1]  # [2, B, n]
+    products = products - (turned[0][:, None] * crossing[0] + turned[1][:, None] * crossing[1])
+    pushes = pushes - (turned[0] * own_push[0] + turned[1] * own_push[1])
+
+    column, factor = _unknowns(problem, model, k)
+    whole = jnp.sum(products[column][:, column] * factor[:, None] * factor, axis=-1)
+    push = jnp.sum(pushes[column] * factor, axis=-1)
+    common_precision = prior_precision(problem, k)
     p = common_precision.shape[0]
     information = whole[:p, :p] + jnp.diag(common_precision)
     across = whole[:p, p:]
     common_push = push[:p] - common_precision * _common(u)
     inverse = scaled_inverse(information)
+    told = own[0, 0] * precision[0] + own[1, 1] * precision[1]
     return NormalEquations(
         information=information,
         push=common_push,
         own=own,
-        crossing=crossing[:, :, :p],
+        crossing=crossing,
         own_push=own_push,
         towards=whole[p:, p:] - across.T @ inverse @ across,
         pull=push[p:] - across.T @ inverse @ common_push,
-        log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(determinant * jnp.prod(model.variance, axis=1)), 0.0)),
-        fitted=jnp.sum(jnp.where(m.valid, 2.0 - jnp.einsum("naa,na->n", own, own_precision), 0.0)),
+        log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(determinant * jnp.prod(model.variance, axis=0)), 0.0)),
+        fitted=jnp.sum(jnp.where(m.valid, 2.0 - told, 0.0)),
     )
+
+
+def _products(one: jax.Array, other: jax.Array) -> jax.Array:
+    """Sums over the regions [A, B, n] of products of [A, R, n] and [B, R, n].
+
+    The regions are few, and a sum that is written out is computed for several windows at a time.
+    """
+    if on_processor():
+        return functools.reduce(jnp.add, (one[:, None, r] * other[:, r] for r in range(one.shape[1])))
+    return jnp.sum(one[:, None] * other, axis=2)
+
+
+def _unknowns(problem: Problem, model: Linearised, sources: int) -> tuple[np.ndarray, jax.Array]:
+    """The column of each of the P unknowns that windows share and of the 3 of the place; its factor [P + 3, n]."""
+    levels, last = len(problem.detectors), model.columns.shape[0]
+    background = 1 + sources
+    column = [*range(background), *[background] * levels, *range(background + 1, last), 0, 0, 0]
+    ones = jnp.ones((1, model.nearer.shape[1]))
+    parts = [ones.repeat(background, 0), detector_of(problem).T, ones.repeat(last - background - 1, 0), model.nearer]
+    return np.array(column), jnp.concatenate(parts)
 
 
 def stepped(problem: Problem, u: Unknowns, at: NormalEquations) -> Unknowns:
     """The unknowns after a Gauss-Newton step."""
     step = jnp.clip(scaled_inverse(at.information) @ at.push, -LONGEST_STEP, LONGEST_STEP)
-    own = jnp.einsum("nab,nb->na", at.own, at.own_push - jnp.einsum("nap,p->na", at.crossing, step))
-    own = jnp.clip(own, -LONGEST_STEP, LONGEST_STEP)
     k, d = u.others.shape[0], u.level.shape[0]
+    sources, levels, lengths = jnp.split(step, [1 + k, 1 + k + d])
+    background = levels @ detector_of(problem).T
+    taken = (
+        jnp.einsum("abn,b->an", at.crossing[:, : 1 + k], sources)
+        + at.crossing[:, 1 + k] * background
+        + jnp.einsum("abn,b->an", at.crossing[:, 2 + k :], lengths)
+    )
+    rest = at.own_push - taken
+    own = jnp.clip(at.own[:, 0] * rest[0] + at.own[:, 1] * rest[1], -LONGEST_STEP, LONGEST_STEP)
     return Unknowns(
-        activity_bq=u.activity_bq * jnp.maximum(1.0 + step[0], LOWEST_SHARE),
-        others=jnp.clip(u.others * jnp.maximum(1.0 + step[1 : 1 + k], LOWEST_SHARE), 1e-3, 1e3),
-        level=u.level + step[1 + k : 1 + k + d],
-        lengths=u.lengths + step[1 + k + d :],
-        background=u.background + own[:, 0],
-        gain=u.gain + own[:, 1],
+        activity_bq=u.activity_bq * jnp.maximum(1.0 + sources[0], LOWEST_SHARE),
+        others=jnp.clip(u.others * jnp.maximum(1.0 + sources[1:], LOWEST_SHARE), 1e-3, 1e3),
+        level=u.level + levels,
+        lengths=u.lengths + lengths,
+        background=u.background + own[0],
+        gain=u.gain + own[1],
     )
 
 
@@ -218,18 +247,18 @@ def log_likelihood(problem: Problem, model: Linearised) -> jax.Array:
     m = problem.measurements
     assert m.rois is not None
     # it grows with the counts: a tenth of all of them are worth a tenth of it
-    trusted, mean = problem.trust * m.rois, problem.trust * jnp.maximum(model.mean, MEAN_FLOOR)
-    return poisson_log_likelihood(trusted, mean, m.valid[:, None])
+    trust = problem.trust.T
+    return poisson_log_likelihood(trust * m.rois.T, trust * jnp.maximum(model.mean, MEAN_FLOOR), m.valid)
 
 
 def window_unknowns(u: Unknowns) -> jax.Array:
-    """The unknowns [n, 2] that each window has to itself: background and gain."""
-    return jnp.stack([u.background, u.gain], axis=-1)
+    """The unknowns [2, n] that each window has to itself: background and gain."""
+    return jnp.stack([u.background, u.gain])
 
 
 def log_prior(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
     """Log prior [] of the unknowns but the place, up to a constant."""
     shared = prior_precision(problem, u.others.shape[0]) * jnp.square(_common(u))
     relative = jnp.square(window_unknowns(u)) / model.variance
-    own = relative[:, 0] + (problem.tail + 1.0) * jnp.log1p(relative[:, 1] / problem.tail)
+    own = relative[0] + (problem.tail + 1.0) * jnp.log1p(relative[1] / problem.tail)
     return -0.5 * (jnp.sum(shared) + jnp.sum(jnp.where(problem.measurements.valid, own, 0.0)))

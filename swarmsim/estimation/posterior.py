@@ -369,10 +369,11 @@ def goodness(problem: Problem, state: State) -> Goodness:
     assert m.rois is not None
     u, model = alone(problem, state.added, state.unknowns, ALONE_STEPS)
     at = normal_equations(problem, model, u)
-    mean = jnp.maximum(model.mean, MEAN_FLOOR)
+    found = model.mean.T
+    mean = jnp.maximum(found, MEAN_FLOOR)
     cells = m.valid[:, None] & (problem.background > 0.0)
     return Goodness(
-        chi_squared=jnp.sum(jnp.where(cells, problem.trust * jnp.square(m.rois - model.mean) / mean, 0.0)),
+        chi_squared=jnp.sum(jnp.where(cells, problem.trust * jnp.square(m.rois - found) / mean, 0.0)),
         freedom=jnp.maximum(jnp.sum(cells) - at.fitted - 4.0 * jnp.sum(state.sources.present), 1.0),
         spread=jnp.sqrt(jnp.sum(jnp.where(cells, 2.0 + 1.0 / mean, 0.0))),
     )

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.estimation.forward import Problem, detector_of, padded, silent
-from swarmsim.estimation.normal_equations import Others, Unknowns, linearised, normal_equations
+from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations, of_window
 from swarmsim.pytree import on_device, pytree
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.ground import basis
@@ -62,36 +62,39 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     assert m.rois is not None
     model = linearised(problem, silent(problem), others, jnp.zeros(3), u)
     at = normal_equations(problem, model, u)
-    weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, 1e-3), 0.0)
+    # windows first
+    mean, columns, of_own = model.mean.T, model.columns.T, of_window(model.columns, u.others.shape[0]).T
+    own_inverse, own_push = at.own.T, at.own_push.T
+    weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(mean, MEAN_FLOOR), 0.0)
     names, models = problem.detectors[0].material_names, detector_of(problem)
     air = names.index("air") if "air" in names else 0
     kernels = [padded(open_rates(d, allowed.shape[0], air), regions) for d in problem.detectors]
     kernel = jnp.stack(kernels)  # [D, N, J, R]
-    share = jnp.sum(model.mean, axis=1) / jnp.maximum(jnp.sum(_true(problem, others, u), axis=1), 1e-9)
+    share = jnp.sum(mean, axis=1) / jnp.maximum(jnp.sum(_true(problem, others, u), axis=1), 1e-9)
     scale = m.exposure_s * share  # [n]
 
     # what is common to all windows: the others' factors and the levels
     k, d = u.others.shape[0], u.level.shape[0]
-    common = model.common[:, :, 1 : 1 + k + d]
+    common = jnp.concatenate([columns[..., 1 : 1 + k], columns[..., 1 + k, None] * models[:, None]], axis=-1)
 
     def eliminated(x: jax.Array) -> jax.Array:
         """V^-1 x [n, R, ...]: the windows' own background and gain eliminated."""
         weighted = weight.reshape(*weight.shape, *[1] * (x.ndim - 2)) * x
-        inside = jnp.einsum("nab,nrb,nr...->na...", at.own, model.own, weighted)
+        inside = jnp.einsum("nab,nrb,nr...->na...", own_inverse, of_own, weighted)
         return weighted - weight.reshape(*weight.shape, *[1] * (x.ndim - 2)) * jnp.einsum(
-            "nra,na...->nr...", model.own, inside
+            "nra,na...->nr...", of_own, inside
         )
 
     # the fit's own deviations have taken up their part already: only what still pushes them is eliminated
-    still = jnp.einsum("nab,nb->na", at.own, at.own_push)
-    left = weight * (m.rois - model.mean - jnp.einsum("nra,na->nr", model.own, still))  # [n, R]
+    still = jnp.einsum("nab,nb->na", own_inverse, own_push)
+    left = weight * (m.rois - mean - jnp.einsum("nra,na->nr", of_own, still))  # [n, R]
     across = eliminated(common)  # [n, R, Q]
     shape = scale[:, None, None, None] * jnp.einsum("nd,dcjr->ncjr", models, kernel)  # [n, N, J, R]
     pushes = jnp.einsum("ncjr,nr->ncj", shape, left)
     crossings = jnp.einsum("ncjr,nrq->ncjq", shape, across)
-    inner = jnp.einsum("nra,nr,ncjr->ncja", model.own, weight, shape)
+    inner = jnp.einsum("nra,nr,ncjr->ncja", of_own, weight, shape)
     own = jnp.einsum("ncjr,nr,ncir->ncji", shape, weight, shape)
-    own = own - jnp.einsum("ncja,nab,ncib->ncji", inner, at.own, inner)
+    own = own - jnp.einsum("ncja,nab,ncib->ncji", inner, own_inverse, inner)
 
     phi = _weights(points_m, m.position_m, m.valid)  # [J, C, n]
     nodes = len(NODES_M)

@@ -15,7 +15,14 @@ from swarmsim.device import each
 from swarmsim.estimation.fit import Settled, settle
 from swarmsim.estimation.forward import Problem, Rates, rates, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
-from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations
+from swarmsim.estimation.normal_equations import (
+    MEAN_FLOOR,
+    Others,
+    Unknowns,
+    linearised,
+    normal_equations,
+    of_window,
+)
 from swarmsim.pytree import pytree
 from swarmsim.site.model import bounds_m
 
@@ -61,12 +68,12 @@ def attempt(problem: Problem, nuclide: jax.Array, others: Others, u: Unknowns, p
 
 @pytree
 class Screen:
-    """What the posterior of other places is approximated with: the fit at one place, linearised."""
+    """What the posterior of other places is approximated with: the fit at one place, linearised. Windows come last."""
 
-    left: jax.Array  # [n, R] counts less those of everything but the source sought
-    weight: jax.Array  # [n, R] over their variance
-    own: jax.Array  # [n, R, 2] change with the window's own unknowns
-    inverse: jax.Array  # [n, 2, 2] of the information about those
+    left: jax.Array  # [R, n] counts less those of everything but the source sought
+    weight: jax.Array  # [R, n] over their variance
+    own: jax.Array  # [2, R, n] change with the window's own unknowns
+    inverse: jax.Array  # [2, 2, n] of the information about those
     registered: jax.Array  # [n] of the counts that are added
 
 
@@ -78,9 +85,9 @@ def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array,
     zero = jnp.zeros_like(u.gain)
     rest = linearised(problem, source, others, where, replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(())))
     return Screen(
-        left=jnp.where(m.valid[:, None], m.rois - rest.mean, 0.0),
-        weight=jnp.where(m.valid[:, None], problem.trust / jnp.maximum(model.mean, MEAN_FLOOR), 0.0),
-        own=model.own,
+        left=jnp.where(m.valid, m.rois.T - rest.mean, 0.0),
+        weight=jnp.where(m.valid, problem.trust.T / jnp.maximum(model.mean, MEAN_FLOOR), 0.0),
+        own=of_window(model.columns, u.others.shape[0]),
         inverse=normal_equations(problem, model, u).own,
         registered=model.registered,
     )
@@ -89,11 +96,11 @@ def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array,
 def screened(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> jax.Array:
     """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted."""
     lengths = jnp.zeros_like(problem.material_std)
-    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts * screen.registered[:, None]
+    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts.T * screen.registered
     weighted = screen.weight * net
-    inside = jnp.stack([jnp.sum(screen.own[..., k] * weighted, axis=1) for k in range(2)], axis=-1)
-    of_left = jnp.stack([jnp.sum(screen.own[..., k] * screen.weight * screen.left, axis=1) for k in range(2)], axis=-1)
-    back = jnp.einsum("nab,nb->na", screen.inverse, inside)
+    inside = jnp.sum(screen.own * weighted, axis=1)  # [2, n]
+    of_left = jnp.sum(screen.own * screen.weight * screen.left, axis=1)
+    back = screen.inverse[:, 0] * inside[0] + screen.inverse[:, 1] * inside[1]
     score = jnp.sum(weighted * screen.left) - jnp.sum(back * of_left)
     whole = jnp.sum(weighted * net)
     information = whole - jnp.sum(back * inside)
