@@ -182,24 +182,20 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) 
 
 def _rates_of_span(problem: Problem, span: Span, nodes: Nodes, source: Source, way: Crossed) -> Rates:
     first, last, number, rays = span
-    share, position, axis = shares_of(rays), nodes.position_m, nodes.axis
+    share, position = shares_of(rays), nodes.position_m
     offset = position - source.position_m
-    detector = problem.detectors[number]
-    rate, slope = roi_rates_and_slopes(detector, source, way, position, axis, problem.uncertain)
-    gain = inverse_square_gain(offset, nodes.pieces_m, rays)
-    exposure = problem.measurements.exposure_s[first:last]
-
-    def over_windows(x: jax.Array) -> jax.Array:
-        ones = [1] * (x.ndim - 1)
-        each = (x * gain.reshape(-1, *ones)).reshape(exposure.shape[0], rays, *x.shape[1:])
-        mean = jnp.sum(each * share.reshape(-1, *ones), axis=1)
-        return padded(mean, problem.background.shape[1]) * exposure.reshape(-1, *ones)
-
-    strength = (jnp.sum(rate, axis=1) * jnp.sum(offset * offset, axis=1)).reshape(-1, rays)
+    detector, exposure = problem.detectors[number], problem.measurements.exposure_s[first:last]
+    weight = jnp.tile(share, last - first) * inverse_square_gain(offset, nodes.pieces_m, rays)
+    found = roi_rates_and_slopes(detector, source, way, position, nodes.axis, problem.uncertain, weight, rays)
+    strength = (found.net * jnp.sum(offset * offset, axis=1)).reshape(-1, rays)
     mean = jnp.sum(share * strength, axis=1)
     spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)
-    edge = EDGE_SHARE * jnp.where(mean > 0.0, spread, 0.0)
-    return Rates(counts=over_windows(rate), slopes=over_windows(slope), edge=edge)
+    regions = problem.background.shape[1]
+    return Rates(
+        counts=padded(found.rates, regions) * exposure[:, None],
+        slopes=padded(found.slopes, regions) * exposure[:, None, None],
+        edge=EDGE_SHARE * jnp.where(mean > 0.0, spread, 0.0),
+    )
 
 
 def padded(values: jax.Array, regions: int) -> jax.Array:

@@ -47,7 +47,7 @@ def open_rates(detector: Detector, nuclides: int, air: int) -> jax.Array:
 
     def of(nuclide: jax.Array) -> jax.Array:
         source = Source(position_m=jnp.zeros(3), activity_bq=jnp.ones(()), nuclide=nuclide)
-        return roi_rates_and_slopes(detector, source, way, place, up)[0] * jnp.square(distance)[:, None]
+        return roi_rates_and_slopes(detector, source, way, place, up).rates * jnp.square(distance)[:, None]
 
     return jax.lax.map(of, jnp.arange(nuclides))
 

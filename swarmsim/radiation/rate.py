@@ -7,10 +7,15 @@ G (`swarmsim.radiation.cylinder`), depth t = sum mu_k x_k, the scattered counts 
 share g that the ground adds (`swarmsim.radiation.ground`).
 """
 
+import functools
+from dataclasses import replace
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim.device import on_processor
 from swarmsim.radiation.cylinder import NEAR_TABLES, direction_basis, near_ratio
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.lines import SPECTRUM_DEPTHS
@@ -221,6 +226,14 @@ def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.
     return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares) + of_ground
 
 
+class RoiRates(NamedTuple):
+    """Rates by region of interest on m ways, of n places on them in all."""
+
+    rates: jax.Array  # [m, R] counts per second
+    slopes: jax.Array  # [m, U, R] their derivatives by ln(length in each of U materials)
+    net: jax.Array  # [n] net rate at each place
+
+
 def roi_rates_and_slopes(
     detector: Detector,
     source: Source,
@@ -228,10 +241,13 @@ def roi_rates_and_slopes(
     position_m: jax.Array,
     axis: jax.Array,
     by: tuple[int, ...] = (),
-) -> tuple[jax.Array, jax.Array]:
-    """`roi_rates` [n, R] of n places, and their derivatives [n, U, R] by ln(length in each material of ``by``).
+    weight: jax.Array | None = None,
+    places: int = 1,
+) -> RoiRates:
+    """`roi_rates` with their derivatives at n places, or sums of them over some places at a time.
 
-    The derivatives leave out that the spectrum of the scattered photons softens with depth.
+    The derivatives leave out that the spectrum of the scattered photons softens with depth, and take it to be the mean
+    one at all places of a sum.
 
     Args:
         detector: of all places.
@@ -239,36 +255,96 @@ def roi_rates_and_slopes(
         way: fields [n, M], from the source to each place.
         position_m, axis: [n, 3] of the crystal.
         by: numbers of U materials (static).
+        weight: [n] of the places in the sums; 1 by default.
+        places: in a sum, neighbours (static).
     """
-    nuclide, chosen = source.nuclide, jnp.array(by, jnp.int32)
-    seen = jax.vmap(lambda place, along: _seen(detector, source, place, along))(position_m, axis)  # [n, L]
-    peaks = detector.peak_rois[nuclide]  # [L, R]
+    given = jnp.ones(axis.shape[0]) if weight is None else weight
+    lines = _lines_of(detector, source.nuclide)
+    one = replace(source, nuclide=jnp.int32(0))
+
+    def of(line: dict[str, Any]) -> RoiRates:
+        return _of_line(replace(detector, **line), one, way, position_m, axis, by, given, places)
+
+    if not on_processor():
+        return RoiRates(*(jnp.sum(x, axis=0) for x in jax.vmap(of)(lines)))
+    # most nuclides have fewer lines than the tables have rows
+    count = jnp.max(jnp.where(detector.yields[source.nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), jax.eval_shape(jax.vmap(of), lines))
+
+    def add(number: jax.Array, sums: RoiRates) -> RoiRates:
+        return jax.tree.map(jnp.add, sums, of(jax.tree.map(lambda x: x[number], lines)))
+
+    return jax.lax.fori_loop(0, count, add, nothing)
+
+
+_LINES = {
+    "yields": 0, "effective_area_m2": 0, "near_share": 0, "attenuation_1_m": 0, "scatter_1_m": 2, "ground": 0,
+    "peak_rois": 0, "scattered_rois": 2, "ground_rois": 0, "line_energy_kev": 0,
+}  # fmt: skip
+"""Tables that rates by region take from a detector, and the axis of the lines in those of a nuclide."""
+
+
+def _lines_of(detector: Detector, nuclide: jax.Array) -> dict[str, jax.Array]:
+    """Those tables of each line [L, 1, ...], as if it were the only one of the only nuclide."""
+    of = {name: jnp.moveaxis(jnp.asarray(getattr(detector, name))[nuclide], axis, 0) for name, axis in _LINES.items()}
+    return {name: jnp.expand_dims(of[name], (1, 2 + axis)) for name, axis in _LINES.items()}
+
+
+def _of_line(
+    detector: Detector,
+    source: Source,
+    way: Crossed,
+    position_m: jax.Array,
+    axis: jax.Array,
+    by: tuple[int, ...],
+    weight: jax.Array,
+    places: int,
+) -> RoiRates:
+    """`roi_rates_and_slopes` of a detector and a nuclide with one line."""
+
+    def summed(x: jax.Array) -> jax.Array:
+        """Sums [m, ...] of [n, ...]; written out, as the arguments are not computed again for it."""
+        x = x * weight.reshape(-1, *[1] * (x.ndim - 1))
+        x = x.reshape(x.shape[0] // places, places, *x.shape[1:])
+        return functools.reduce(jnp.add, (x[:, k] for k in range(places)))
+
+    chosen = np.array(by, np.int32)
+    seen = jax.vmap(lambda place, along: _seen(detector, source, place, along))(position_m, axis)[:, 0]  # [n]
+    peaks = detector.peak_rois[0, 0]  # [R]
     if detector.kind == "paper_ideal":
-        lengths = way.length_m[:, None, :] * detector.attenuation_1_m[nuclide]
+        lengths = way.length_m * detector.attenuation_1_m[0, 0]
         direct = seen * jnp.exp(-jnp.sum(lengths, axis=-1))
-        return direct @ peaks, -jnp.einsum("nlu,nl,lr->nur", lengths[..., chosen], direct, peaks)
-    found = _scattered(detector, nuclide, way)  # [n, L]
-    layers, depth = found.layers, found.depth
-    direct = seen * jnp.exp(-found.slant)
+        falling = summed(lengths[:, chosen] * direct[:, None])
+        return RoiRates(summed(direct)[:, None] * peaks, -falling[..., None] * peaks, direct)
+    found = _scattered(detector, source.nuclide, way)
+    layers, depth, slants = found.layers[:, 0], found.depth[:, 0], found.slant_layers[:, 0, chosen]
+    direct, scattered = seen * jnp.exp(-found.slant[:, 0]), seen * found.counts[:, 0]
+    both, of_walls = direct + scattered, 1.0 - detector.surrounds[chosen]
+    by_ground, rise = jnp.zeros_like(depth), jnp.zeros_like(depth)
+    if way.shape is not None:
+        by_ground, rise = (x[:, 0] for x in _from_ground(detector, source.nuclide, way, found.layers))
     low, high = SPECTRUM_DEPTHS
     deep = jnp.clip((depth - low) / (high - low), 0.0, 1.0)
-    part = jnp.where(depth[..., None] > 1e-6, layers / jnp.maximum(depth, 1e-6)[..., None], 1.0 / layers.shape[-1])
-    mixed = jnp.stack([(1.0 - deep)[..., None] * part, deep[..., None] * part], axis=2)  # [n, L, depths, M]
-    shares = jnp.einsum("nldm,dmlr->nlr", mixed, detector.scattered_rois[nuclide])
-    nothing = jnp.zeros_like(depth)
-    by_ground, rise = (nothing, nothing) if way.shape is None else _from_ground(detector, nuclide, way, layers)
-    ground = by_ground[..., None] * detector.ground_rois[nuclide]
-    shares, peaks = shares + ground, peaks + ground  # [n, L, R]
-    rates = jnp.einsum("nl,nlr->nr", direct, peaks) + jnp.einsum("nl,nlr->nr", seen * found.counts, shares)
-    slants = found.slant_layers[..., chosen]  # [n, L, U]
-    changes = layers[..., chosen] * found.by_depth[..., None]
-    changes -= detector.surrounds[chosen] * layers[..., chosen] * found.by_walls[..., None]
-    of_scattered = (seen[..., None] * changes)[..., None] * shares[:, :, None]
-    slopes = jnp.sum(of_scattered - (slants * direct[..., None])[..., None] * peaks[..., None, :], axis=1)
-    rising = (
-        (rise * (direct + seen * found.counts))[..., None] * layers[..., chosen] * (1.0 - detector.surrounds[chosen])
+    # where nothing lies between, nothing is scattered
+    per_depth = scattered / jnp.maximum(depth, 1e-6)
+    spectrum = sum(
+        summed((per_depth * share)[:, None] * layers) @ table
+        for share, table in zip((1.0 - deep, deep), detector.scattered_rois[0, :, :, 0], strict=True)
     )
-    return rates, slopes + jnp.einsum("nlu,lr->nur", rising, detector.ground_rois[nuclide])
+    ground = detector.ground_rois[0, 0]
+    rates = summed(direct)[:, None] * peaks + spectrum + summed(by_ground * both)[:, None] * ground
+    chosen_layers = layers[:, chosen]
+    changes = chosen_layers * (seen * found.by_depth[:, 0])[:, None]
+    changes -= (1.0 - of_walls) * chosen_layers * (seen * found.by_walls[:, 0])[:, None]
+    falls = slants * direct[:, None]
+    of_ground = by_ground[:, None] * (changes - falls) + (rise * both)[:, None] * chosen_layers * of_walls
+    shape = spectrum / jnp.maximum(summed(scattered), 1e-30)[:, None]
+    slopes = (
+        summed(changes)[..., None] * shape[:, None]
+        - summed(falls)[..., None] * peaks
+        + summed(of_ground)[..., None] * ground
+    )
+    return RoiRates(rates, slopes, both * (1.0 + by_ground))
 
 
 def observed_rois(detector: Detector, net_cps: jax.Array, background: jax.Array | float = 1.0) -> jax.Array:

@@ -76,7 +76,7 @@ def test_rates_with_slopes_are_the_rates_and_slopes_their_differences(
     way, place, axis = ways(d, k, 24)
     columns, step = [d.material_names.index(name) for name in ("air", "concrete")], 0.05
     found = _with_slopes(d, source(k), way, place, axis, by=tuple(columns))
-    rates, slopes = (np.asarray(x, float) for x in found)
+    rates, slopes = np.asarray(found.rates, float), np.asarray(found.slopes, float)
     np.testing.assert_allclose(rates, _each(d, jnp.int32(k), way, place, axis), rtol=2e-4, atol=1e-6 * rates.max())
     up, down = (
         np.stack([_each(d, jnp.int32(k), thicker(way, m, np.exp(s)), place, axis) for m in columns], axis=1)
@@ -97,7 +97,7 @@ def test_slopes_by_leaves_are_those_of_what_surrounds(detectors: Detectors, name
     assert way.shape is not None
     shape = replace(way.shape, thin_m=way.shape.thin_m.at[:, leaves].set(crowns))
     way = replace(way, length_m=way.length_m.at[:, leaves].set(crowns), shape=shape)
-    _, slopes = _with_slopes(d, source(k), way, place, axis, by=(leaves,))
+    _, slopes, _ = _with_slopes(d, source(k), way, place, axis, by=(leaves,))
     # of all regions together, to which it does not matter that the spectrum softens
     up, down = (
         np.sum(_each(d, jnp.int32(k), thicker(way, leaves, np.exp(s)), place, axis), axis=1) for s in (0.05, -0.05)
