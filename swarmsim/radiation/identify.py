@@ -100,12 +100,20 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
     ``view`` is how the crystal saw the source (`swarmsim.radiation.rate.mean_view`), by default from far away, end on:
     from the side or close by, soft photons count more than hard ones.
 
-    With no counts or no live time the posterior is the prior. Only nuclides for which the detector has tables are
-    named, and at most three at once. Raises `InputError` for a detector without energy resolution.
+    Without live time and counts the posterior is the prior. Of what is no spectrum (numbers below zero or none, counts
+    without live time) the answer is `UNKNOWN`, with a confidence and a goodness of 0. Only nuclides for which the
+    detector has tables are named, and at most three at once. Raises `InputError` for a detector without energy
+    resolution, and for another number of channels than the detector's.
     """
     if not detector.identification_bins:
         raise InputError.of("a counter without energy resolution tells no nuclides apart: use a scintillator")
+    channels = detector.energy_kev.shape
+    if jnp.shape(counts) != channels:
+        raise InputError.of(f"the spectrum has the shape {jnp.shape(counts)}, and the detector's {channels} (channels)")
     n = len(detector.nuclide_names)
+    sound = jnp.all(jnp.isfinite(counts) & (counts >= 0)) & jnp.isfinite(live_s)
+    sound &= (live_s > 0.0) | (jnp.sum(counts) == 0)
+    counts, live_s = jnp.where(sound, counts, 0.0), jnp.where(sound, live_s, 0.0)
     table, data = tables(detector, view), binned_data(detector, counts, live_s)
     strangers = _strangers(detector, table, data)
     stages = _stages(table, data, jnp.asarray(np.log(shield_shares(detector)), jnp.float32), n)
@@ -136,15 +144,15 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
     fitted = 4.0 + 3.0 * jnp.sum(sources.present)
     shields = table.sources.shape[0] // n
     return Identification(
-        nuclide=jnp.where(named, main, nothing).astype(jnp.int32),
-        confidence=jnp.where(named, present[main], other),
+        nuclide=jnp.where(sound, jnp.where(named, main, nothing), UNKNOWN).astype(jnp.int32),
+        confidence=jnp.where(sound, jnp.where(named, present[main], other), 0.0),
         posterior=present,
         none=none_chance,
         unknown=unknown_chance,
         strength_cps=jnp.zeros(n).at[sources.row // shields].add(each) / jnp.maximum(live_s, 1e-3),
         gain=best.gain,
         width=jnp.sqrt(1.0 + 2.0 * best.time),
-        goodness=p_value(data.counts, best.expected, data.certainty, fitted, _MODEL_ERROR),
+        goodness=jnp.where(sound, p_value(data.counts, best.expected, data.certainty, fitted, _MODEL_ERROR), 0.0),
         fit=_in_channels(detector, best.expected),
         stranger=strangers.nuclide,
         alike=strangers.share * jnp.exp(known - unknown),

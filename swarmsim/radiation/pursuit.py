@@ -142,9 +142,14 @@ def _added(
 
 def of_library(tables: Tables, data: Data, sources: Sources, gain: jax.Array) -> Hypothesis:
     """The hypothesis of some sources about a gain [] int32 of the tables."""
-    of_source = jnp.stack([tables.sources[sources.row, gain], tables.scattered[sources.row, gain]], axis=1)
+    scattered = tables.scattered[sources.row, gain]
+    share = jnp.sum(scattered[:, 0], axis=-1)
+    # both columns sum to 1, so that what stands before them is counts
+    of_source = jnp.stack(
+        [tables.sources[sources.row, gain], scattered / jnp.maximum(share, 1e-9)[:, None, None]], axis=1
+    )
     about = jnp.maximum(sources.strength, 0.02 * data.natural) * sources.present
-    scale = about[:, None] * jnp.array([1.0, PART_STD])
+    scale = about[:, None] * jnp.stack([jnp.ones_like(share), PART_STD * share], axis=1)
     start = (sources.strength * sources.present)[:, None] * jnp.array([1.0, 0.0])
     strengths = jnp.tile(jnp.array([1.0, 0.0]), SOURCES)
     column = of_source.reshape(SOURCES * PARTS, ORDERS, -1)

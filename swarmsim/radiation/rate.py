@@ -123,7 +123,10 @@ def mean_view(detector: Detector, offset_m: jax.Array, axis: jax.Array, weight: 
         offset_m: [n, 3] from the places on the way to the source.
         axis: [n, 3] of the crystal there.
         weight: [n] how long it was there; rows without any may hold anything. With none at all it is seen `end_on`.
+            Those below zero, or that are no numbers, are none.
     """
+    weight = jnp.where(jnp.isfinite(weight), jnp.maximum(weight, 0.0), 0.0)
+    weight = weight / jnp.maximum(jnp.max(weight), 1e-30)
     offset_m, axis = (jnp.where(weight[:, None] > 0.0, x, 1.0) for x in (offset_m, axis))
     basis, near, squared = jax.vmap(lambda offset, along: _view(detector, offset, along))(offset_m, axis)
     share = weight / squared

@@ -10,6 +10,7 @@ from scipy.stats import kstest
 from swarmsim.config.errors import InputError
 from swarmsim.config.load import load_named
 from swarmsim.radiation import Detector, Identification, Library, build_detector, identify, spectrum_rate
+from swarmsim.radiation.detector import AIR
 from swarmsim.radiation.goodness import p_value
 from swarmsim.radiation.identify import NONE, UNKNOWN, _present
 from swarmsim.radiation.laplace import COLUMNS, NATURAL, NATURAL_STD, Data, Hypothesis, laplace, swept
@@ -162,6 +163,43 @@ def test_a_mixture_names_both(detectors: Detectors) -> None:
     assert np.all(np.asarray(found.posterior)[:, [co60, cs137]] > 0.9)
     assert np.all(np.asarray(found.nuclide) == co60)
     np.testing.assert_allclose(np.mean(found.strength_cps, axis=0)[[co60, cs137]], (120, 60), rtol=0.25)
+
+
+def test_strengths_are_the_counts_of_the_sources(detectors: Detectors) -> None:
+    """Also where far more photons are scattered than in the templates, or fewer: both columns of a source count."""
+    detector = detectors["nai_2x2", "physical"]
+    air = jnp.arange(len(detector.material_names)) == detector.material_names.index(AIR)
+    for metres, above in ((0.3, 0.0), (2.0, 0.1), (2.0, 1.0), (12.0, 0.0)):
+        ratio = []
+        for name in ("Co-60", "Cs-137", "Ba-133", "Eu-152", "Tc-99m"):
+            mean = np.asarray(shielded(detector, detector.nuclide_names.index(name), metres * air, 0.5, above))
+            mean = 1500.0 * mean / mean.sum()
+            counts = np.round((mean + np.asarray(detector.background_spectrum)) * LIVE_S)
+            found = run(detector, counts[None], LIVE_S)
+            ratio.append(float(found.strength_cps[0].sum()) / 1500.0)
+        np.testing.assert_allclose(ratio, 1.0, atol=0.1, err_msg=f"{metres} m, ground {above}")
+
+
+@pytest.mark.parametrize("fault", ["negative", "none", "no time", "background taken off"])
+def test_what_is_no_spectrum_has_no_name(detectors: Detectors, fault: str) -> None:
+    detector = detectors["nai_2x2", "physical"]
+    counts, live = np.asarray(spectrum(detector, "Co-60", 100.0)) * LIVE_S, LIVE_S
+    if fault == "negative":
+        counts[100] = -1.0
+    elif fault == "none":
+        counts[100] = np.nan
+    elif fault == "background taken off":
+        counts -= 40.0
+    else:
+        live = 0.0
+    found = run(detector, counts[None], live)
+    assert (found.nuclide[0], found.confidence[0], found.goodness[0]) == (UNKNOWN, 0.0, 0.0)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+
+
+def test_a_spectrum_of_other_channels_is_refused(detectors: Detectors) -> None:
+    with pytest.raises(InputError, match="channels"):
+        identify(detectors["nai_2x2", "physical"], jnp.ones(512), jnp.float32(60.0))
 
 
 def drifted(detector: Detector, mean: np.ndarray, gain: float) -> np.ndarray:
