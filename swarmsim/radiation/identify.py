@@ -140,8 +140,8 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
     nobody = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), stages.best.sources)
     best, sources = jax.tree.map(lambda leaf: leaf[last], (fits, nobody))
     each = jnp.sum(strengths(best), axis=1) * sources.present
-    # background, tilt, gain and width; strength, shield and scattered photons of each
-    fitted = 4.0 + 3.0 * jnp.sum(sources.present)
+    # background, tilt, gain and width; strength, shield and scattered photons of each, here and beside
+    fitted = 4.0 + 4.0 * jnp.sum(sources.present)
     shields = table.sources.shape[0] // n
     return Identification(
         nuclide=jnp.where(sound, jnp.where(named, main, nothing), UNKNOWN).astype(jnp.int32),
@@ -176,15 +176,18 @@ def _strangers(detector: Detector, table: Tables, data: Data) -> _Strangers:
     chosen, shield_log_share = detector.stranger, np.log(stranger_shares(detector))
     nuclide_log_share = jnp.log(jnp.maximum(chosen / jnp.maximum(jnp.sum(chosen), 1.0), 1e-30))
     prior = (nuclide_log_share[:, None] + shield_log_share).ravel()
-    known = known_strangers(table, data, found, detector.known_spectrum, detector.known_scattered, prior)
+    shields = len(shield_log_share)
+    ground = np.arange(prior.shape[0]) // shields * shields + min(1, shields - 1)  # the second of each
+    spectra, scattered = detector.known_spectrum, detector.known_scattered
+    known = known_strangers(table, data, found, spectra, scattered, jnp.asarray(ground), prior)
     lines = lines_of_strangers(table, data, weight, natural_slopes(table, data), found.base_gain)
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), known, lines)
     fits = jax.vmap(jax.vmap(lambda hypothesis: laplace(hypothesis, data)))(both.hypotheses)
     fitted = fits.score + both.places
     # what is not fitted is off by as much as what is
     evidence = both.total + logsumexp(fitted, axis=1) - logsumexp(both.score, axis=1)
-    nuclide = known.row[jnp.argmax(fitted[0])] // len(shield_log_share)
-    own = logsumexp((found.score + prior).reshape(-1, len(shield_log_share))[nuclide]) - known.total
+    nuclide = known.row[jnp.argmax(fitted[0])] // shields
+    own = logsumexp((found.score + prior).reshape(-1, shields)[nuclide]) - known.total
     return _Strangers(evidence[0], evidence[1], nuclide.astype(jnp.int32), jnp.exp(own))
 
 

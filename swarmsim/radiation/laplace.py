@@ -1,10 +1,10 @@
 """Evidence of hypotheses about a spectrum, by Laplace's method (device side).
 
 Under a hypothesis the expected spectrum is a sum of columns (the background's amplitude and tilt; of each source its
-spectrum behind a wall, and more or fewer scattered photons), at a gain and a relative width of peaks of its own.
-Columns are polynomials in both (`swarmsim.radiation.lines.orders`). Fisher scoring finds the maximum of Poisson
-likelihood times prior; the evidence is that maximum times the volume of the posterior over that of the prior (Kass and
-Raftery, J. Am. Stat. Assoc. 90, 1995, 773, eq. 4), so that no parameter is merely fitted.
+spectrum behind a wall, more or fewer scattered photons, and those of air or of the ground beside), at a gain and a
+relative width of peaks of its own. Columns are polynomials in both (`swarmsim.radiation.lines.orders`). Fisher scoring
+finds the maximum of Poisson likelihood times prior; the evidence is that maximum times the volume of the posterior over
+that of the prior (Kass and Raftery, J. Am. Stat. Assoc. 90, 1995, 773, eq. 4), so that no parameter is merely fitted.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from swarmsim.radiation.goodness import deviance
 
 NATURAL = 2  # columns of the background: amplitude and tilt
 SOURCES = 3  # sources of a hypothesis at most
-PARTS = 2  # columns of a source: behind its wall, more or fewer scattered photons
+PARTS = 3  # columns of a source: behind its wall, more or fewer scattered photons there, and of other matter
 COLUMNS = NATURAL + SOURCES * PARTS
 GAIN_STD, WIDTH_STD = 0.02, 0.1  # of the prior of gain and width
 GAIN_RANGE, WIDTH_RANGE = (0.965, 1.035), (-0.14, 0.16)

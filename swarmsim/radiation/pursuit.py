@@ -30,7 +30,7 @@ from swarmsim.radiation.laplace import (
 from swarmsim.radiation.lines import GAINS, ORDERS
 from swarmsim.radiation.templates import Tables
 
-LINES = SOURCES * PARTS
+LINES = 6
 """Lines of a source that the library lacks, at most."""
 STRANGERS = 2  # sources that the library lacks, which are fitted in full
 _SMOOTH = np.exp(-0.5 * (np.arange(-5, 6) / 2.0) ** 2)  # weights of neighbouring bins, narrower than a peak
@@ -142,16 +142,17 @@ def _added(
 
 def of_library(tables: Tables, data: Data, sources: Sources, gain: jax.Array) -> Hypothesis:
     """The hypothesis of some sources about a gain [] int32 of the tables."""
-    scattered = tables.scattered[sources.row, gain]
-    share = jnp.sum(scattered[:, 0], axis=-1)
-    # both columns sum to 1, so that what stands before them is counts
-    of_source = jnp.stack(
-        [tables.sources[sources.row, gain], scattered / jnp.maximum(share, 1e-9)[:, None, None]], axis=1
-    )
+    own, other = sources.row, tables.beside[sources.row]
+    scattered = jnp.stack([tables.scattered[row, gain] for row in (own, other)], axis=1)  # [SOURCES, 2, ORDERS, bins]
+    share = jnp.sum(scattered[:, :, 0], axis=-1) * jnp.stack([jnp.ones_like(own), own != other], axis=1)
+    # all columns sum to 1, so that what stands before them is counts
+    scattered /= jnp.maximum(share, 1e-9)[:, :, None, None]
+    of_source = jnp.concatenate([tables.sources[own, gain][:, None], scattered], axis=1)
     about = jnp.maximum(sources.strength, 0.02 * data.natural) * sources.present
-    scale = about[:, None] * jnp.stack([jnp.ones_like(share), PART_STD * share], axis=1)
-    start = (sources.strength * sources.present)[:, None] * jnp.array([1.0, 0.0])
-    strengths = jnp.tile(jnp.array([1.0, 0.0]), SOURCES)
+    scale = about[:, None] * jnp.concatenate([jnp.ones((SOURCES, 1)), PART_STD * share], axis=1)
+    first = jnp.arange(PARTS) == 0
+    start = (sources.strength * sources.present)[:, None] * first
+    strengths = jnp.tile(first.astype(jnp.float32), SOURCES)
     column = of_source.reshape(SOURCES * PARTS, ORDERS, -1)
     return _hypothesis(tables, data, column, scale.ravel(), strengths, start.ravel(), gain)
 
@@ -228,12 +229,19 @@ def lines_of_strangers(tables: Tables, data: Data, weight: jax.Array, slope: jax
 
 
 def known_strangers(
-    tables: Tables, data: Data, found: Found, known: jax.Array, scattered: jax.Array, prior: jax.Array
+    tables: Tables,
+    data: Data,
+    found: Found,
+    known: jax.Array,
+    scattered: jax.Array,
+    ground: jax.Array,
+    prior: jax.Array,
 ) -> Strangers:
     """The nuclides among those that are not looked for which explain the spectrum best, each behind some shield.
 
     ``found`` ranks their spectra ``known`` [rows, gains, bins], of which ``scattered`` [rows, bins] is the part of
-    scattered photons; ``prior`` [rows] is the logarithm of their prior.
+    scattered photons; ``ground`` [rows] are the rows of the same nuclides above the ground, and ``prior`` [rows] is the
+    logarithm of their prior.
     """
     ranked = found.score + prior
     score, row = jax.lax.top_k(ranked, STRANGERS)
@@ -241,10 +249,11 @@ def known_strangers(
 
     def hypothesis(row: jax.Array) -> Hypothesis:
         gain, extra = found.gain[row], COLUMNS - NATURAL - PARTS
+        beside = jnp.where(row == ground[row], 0.0, scattered[ground[row]])
         column = jnp.zeros((COLUMNS - NATURAL, ORDERS, bins))
-        column = column.at[:PARTS, 0].set(jnp.stack([known[row, gain], scattered[row]]))
+        column = column.at[:PARTS, 0].set(jnp.stack([known[row, gain], scattered[row], beside]))
         about = jnp.maximum(found.strength[row], 0.02 * data.natural)
-        scale = jnp.pad(about * jnp.array([1.0, PART_STD]), (0, extra))
+        scale = jnp.pad(about * jnp.array([1.0, PART_STD, PART_STD]), (0, extra))
         start = jnp.pad(found.strength[row][None], (0, extra + PARTS - 1))
         return _hypothesis(tables, data, column, scale, jnp.zeros(COLUMNS - NATURAL).at[0].set(1.0), start, gain)
 

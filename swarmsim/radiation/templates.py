@@ -32,6 +32,7 @@ class Tables(NamedTuple):
     background: jax.Array  # [gains, 2, orders, bins] as it is, sums to 1, and times `tilt`
     sources: jax.Array  # [N shields, gains, orders, bins] sum to 1
     scattered: jax.Array  # [N shields, gains, orders, bins] the part of scattered photons
+    beside: jax.Array  # [N shields] int32, whose scattered photons another matter than that of each adds (`_beside`)
     lines: jax.Array  # [shields, grid, bins]
 
 
@@ -85,8 +86,18 @@ def tables(detector: Detector, view: jax.Array | None = None) -> Tables:
         background=detector.natural_orders,
         sources=(unscattered + scattered).reshape(-1, *size),
         scattered=scattered.reshape(-1, *size),
+        beside=(len(layers) * jnp.arange(n)[:, None] + _beside(detector)).reshape(-1),
         lines=detector.grid_spectrum,
     )
+
+
+def _beside(detector: Detector) -> NDArray[np.intp]:
+    """Which shield [shields] has what scatters besides: air where there is no wall, the ground elsewhere; or itself."""
+    depth, air, ground = (np.array(column) for column in list(zip(*shields(detector), strict=True))[1:])
+    own = np.arange(len(depth))
+    of_air = np.argmax(air > 0.0) if np.any(air > 0.0) else own
+    of_ground = np.argmax(ground > 0.0) if np.any(ground > 0.0) else own
+    return np.where((depth > 0.0) | (air > 0.0), of_ground, of_air)
 
 
 def _counts(
