@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -172,11 +171,12 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) 
         def seen(span: Span = span, nodes: Nodes = nodes, way: Crossed = way) -> Rates:
             return _rates_of_span(problem, span, nodes, source, way)
 
-        def nothing(seen: Any = seen) -> Any:
-            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(seen))
+        first, last = span[:2]
 
-        used = jnp.any(problem.measurements.valid[span[0] : span[1]])
-        parts.append(either(used, seen, nothing))
+        def nothing(rows: int = last - first) -> Rates:
+            return jax.tree.map(lambda x: x[:rows], silent(problem))
+
+        parts.append(either(jnp.any(problem.measurements.valid[first:last]), seen, nothing))
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
