@@ -3,7 +3,7 @@
 The hypotheses: background only; one nuclide; two or three nuclides; a stranger, which is a nuclide that is known of but
 not looked for (`swarmsim.radiation.strangers`), or else a few lines of any energies. A nuclide is bare, above the
 ground, or behind one of many shields (water, concrete, steel, lead of some depth, air), with more or fewer scattered
-photons than that would make; so are lines.
+photons than that would make, and some of air or of the ground besides; lines are behind shields too.
 The evidence of each hypothesis is the mean of the likelihood over shields, strengths, gain, resolution and background
 (`swarmsim.radiation.laplace`), so that what explains more spectra is not preferred for fitting one of them.
 Posterior = evidence x prior, where each bin's deviance is reduced to account for the error of the templates.
