@@ -1,9 +1,10 @@
 """Bayesian identification of the nuclides in a spectrum (device side).
 
-The hypotheses: background only; one nuclide; two or three nuclides; a stranger, which is a nuclide that is known of but
-not looked for (`swarmsim.radiation.strangers`), or else a few lines of any energies. A nuclide is bare, above the
-ground, or behind one of many shields (water, concrete, steel, lead of some depth, air), with more or fewer scattered
-photons than that would make, and some of air or of the ground besides; lines are behind shields too.
+The hypotheses: background only; one nuclide, behind one shield or two; two or three nuclides; a stranger, which is a
+nuclide that is known of but not looked for (`swarmsim.radiation.strangers`), or else a few lines of any energies. A
+nuclide is bare, above the ground, or behind one of many shields (water, concrete, steel, lead of some depth, air), with
+more or fewer scattered photons than that would make, and some of air or of the ground besides; lines are behind shields
+too.
 The evidence of each hypothesis is the mean of the likelihood over shields, strengths, gain, resolution and background
 (`swarmsim.radiation.laplace`), so that what explains more spectra is not preferred for fitting one of them.
 Posterior = evidence x prior, where each bin's deviance is reduced to account for the error of the templates.
@@ -42,7 +43,8 @@ NONE, UNKNOWN = -1, -2
 CANDIDATES = 10  # sources that are fitted in full at each stage
 _SHIELDS_EACH = 3  # of one nuclide among them
 # Prior: a hotspot may be natural background, may be no nuclide of the library, and is rarely a mixture.
-_PRIOR_NONE, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.4, 0.08, 0.02
+_PRIOR_NONE, _PRIOR_ONE, _PRIOR_TWO, _PRIOR_THREE = 0.4, 0.36, 0.08, 0.02
+_PRIOR_AGAIN = 0.04  # of one nuclide that the way sees behind two shields, or behind a mixed one
 _PRIOR_KNOWN, _PRIOR_LINES = 0.07, 0.03  # of a stranger that is known of, and of one that is not
 _BASE_SIZE = (0, 1, 1, 2)  # nuclides of the base of each stage
 _MODEL_ERROR = 0.015
@@ -162,10 +164,16 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
 def _present(added: jax.Array, base: jax.Array) -> jax.Array:
     """Probability [N] that each nuclide is present, of the chances [stages, N] of each that is added to a base.
 
-    ``base`` [stages, N] is 1 for the nuclides of each base. Chances that sum to 1 exceed it by single precision's
-    rounding when they are summed anew: that is cut off, as a probability of 1.0000001 is none.
+    ``base`` [stages, N] is 1 for the nuclides of each base, to which one of them may be added again. Chances that sum
+    to 1 exceed it by single precision's rounding when they are summed anew: that is cut off, as a probability of
+    1.0000001 is none.
     """
-    return jnp.minimum(jnp.sum(added, axis=1) @ base + jnp.sum(added, axis=0), 1.0)
+    return jnp.minimum(jnp.sum(added, axis=1) @ base + jnp.sum(added * (1.0 - base), axis=0), 1.0)
+
+
+def _log_again(n: int) -> float:
+    """Logarithm of the prior of a nuclide behind two shields over that of two of ``n`` nuclides."""
+    return math.log(_PRIOR_AGAIN / n) - math.log(_PRIOR_TWO / max(math.comb(n, 2), 1))
 
 
 def _strangers(detector: Detector, table: Tables, data: Data) -> _Strangers:
@@ -223,8 +231,9 @@ def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stag
         own = Sources(base.sources.row, base.sources.present, jnp.sum(strengths(base.fit), axis=1))
         found = added_to(own, base.fit.counts)
         in_base = jnp.zeros(n).at[base.sources.row // shields].max(base.sources.present)
-        again = in_base > 0.0
-        ranked = found.score + row_prior + jnp.where(jnp.repeat(again, shields), -1e6, 0.0)
+        # the nuclides of the base may be behind another shield as well
+        prior = row_prior + jnp.repeat(jnp.where(in_base > 0.0, _log_again(n), 0.0), shields)
+        ranked = found.score + prior
         by_nuclide, which = jax.lax.top_k(ranked.reshape(n, shields), _SHIELDS_EACH)
         few = jax.lax.top_k(by_nuclide.ravel(), min(CANDIDATES, n * _SHIELDS_EACH))[1]
         row = few // _SHIELDS_EACH * shields + which.ravel()[few]
@@ -238,11 +247,11 @@ def _stages(table: Tables, data: Data, shield_prior: jax.Array, n: int) -> _Stag
         ]
         fits = jax.vmap(lambda h: laplace(h, data))(jax.tree.map(lambda *a: jnp.concatenate(a), *hypotheses))
         many, first_many = row.shape[0], few.shape[0]
-        fitted = fits.score[:many] + row_prior[row]
+        fitted = fits.score[:many] + prior[row]
         # what is not fitted is off by as much as what is
         shift = logsumexp(fitted[:first_many]) - logsumexp(ranked[row[:first_many]])
         scores = (ranked + shift).at[row].set(-jnp.inf)
-        scores = scores.at[row].max(fitted + jnp.where(again[row // shields], -1e6, 0.0))
+        scores = scores.at[row].max(fitted)
         evidence = logsumexp(scores.reshape(n, shields), axis=1)
         best = jnp.argmax(fitted)
 

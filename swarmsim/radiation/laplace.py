@@ -31,6 +31,7 @@ _ITERATIONS = 6
 _LOOSE = 0.01  # precision that stands for the prior of a strength while it is fitted
 _TEMPLATE_ERROR = 0.04  # relative error of the templates in a bin: an estimate
 _STRENGTH_SCALE = 0.3  # scale of the half-Cauchy prior of a source's strength, in units of the background
+FAILED = -1e6  # score of a fit that came to nothing
 _COUNTS_FLOOR = 0.02  # per bin: keeps the information finite where almost no counts are expected
 
 
@@ -141,7 +142,15 @@ def laplace(hypothesis: Hypothesis, data: Data) -> Fit:
     score -= 0.5 * jnp.sum(x[-2:] ** 2) + 0.5 * log_volume
     # the matrix has the loose precision where a column is absent
     score += 0.5 * jnp.sum((1.0 - present) * jnp.log(precision[:COLUMNS]))
-    return Fit(score, counts, offset + middle, time, expected)
+    # columns that are as good as alike can lead the steps away, to where nothing is expected
+    sound = jnp.isfinite(score) & jnp.all(jnp.isfinite(counts)) & jnp.all(jnp.isfinite(expected))
+    return Fit(
+        score=jnp.where(sound, score, FAILED),
+        counts=jnp.where(sound, counts, start),
+        gain=jnp.where(sound, offset + middle, middle),
+        time=jnp.where(sound, time, 0.0),
+        expected=jnp.where(sound, expected, jnp.maximum(start @ column[:, 0], _COUNTS_FLOOR * 0.1)),
+    )
 
 
 def swept(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:

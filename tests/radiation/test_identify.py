@@ -169,6 +169,47 @@ def test_scattering_by_air_and_the_ground_is_no_nuclide(library: Library, detect
     assert np.all(found.nuclide == numbers)
 
 
+@pytest.mark.parametrize("wall", ["lead", "steel"])
+def test_a_nuclide_behind_two_shields_is_one(detectors: Detectors, wall: str) -> None:
+    """Half of the counts from the way in the open, half from behind a wall: no template, and no second nuclide."""
+    detector = detectors["nai_2x2", "physical"]
+    numbers, net = np.arange(len(detector.nuclide_names)), 3000.0
+    is_wall = jnp.arange(len(detector.material_names)) == detector.material_names.index(wall)
+
+    def half(k: jax.Array, depth: float) -> jax.Array:
+        found = shielded(detector, k, thickness_m(detector, k, jnp.argmax(is_wall), jnp.float32(depth)) * is_wall)
+        return 0.5 * found / jnp.sum(found)
+
+    live = net / float(detector.background_cps)
+    rng, right, absent = np.random.default_rng(0), [], []
+    for depth in (2.0, 5.0):
+        mean = np.asarray(jax.vmap(lambda k, d=depth: half(k, 0.0) + half(k, d))(jnp.asarray(numbers)))
+        found = run(detector, rng.poisson(mean * net + np.asarray(detector.background_spectrum) * live), live)
+        right.append(found.nuclide == numbers)
+        others = np.asarray(found.posterior).copy()
+        others[numbers, numbers] = 0.0
+        absent.append(others.max(axis=1) > 0.9)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
+    assert np.mean(right) >= 0.94
+    assert np.mean(absent) <= 0.1
+
+
+def test_a_fit_that_comes_to_nothing_has_the_least_score(detectors: Detectors) -> None:
+    """Two sources alike but for their scattered photons, far from the counts: single precision loses the steps."""
+    bins, rng = 60, np.random.default_rng(0)
+    shape = np.exp(-np.linspace(0.0, 6.0, bins)) + 1e-3
+    column = np.zeros((COLUMNS, ORDERS, bins), np.float32)
+    column[:, 0] = shape / shape.sum() * (1.0 + 1e-6 * rng.normal(size=(COLUMNS, bins)))
+    alike = Hypothesis(
+        column=jnp.asarray(column), scale=jnp.full(COLUMNS, 1e20), strength=jnp.zeros(COLUMNS).at[2].set(1.0),
+        start=jnp.full(COLUMNS, 1e25), gain=jnp.float32(1.0),
+    )  # fmt: skip
+    data = Data(jnp.full(bins, 1e3), jnp.ones(bins), jnp.float32(1e3), jnp.float32(300.0))
+    fit = laplace(alike, data)
+    assert fit.score <= -1e5
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(fit))
+
+
 def test_a_mixture_names_both(detectors: Detectors) -> None:
     detector = detectors["nai_2x2", "physical"]
     both = spectrum(detector, "Co-60", 120.0) + spectrum(detector, "Cs-137", 60.0)
