@@ -82,6 +82,7 @@ class SourceFits:
     detection: jax.Array  # [K] twice the logarithm of the likelihood ratio against the same without it
     effective_samples: jax.Array  # [K] number of independent places that the posterior's weighted ones are worth
     converged: jax.Array  # [K] bool: those are enough, and two halves of them agree
+    joined: jax.Array  # [K] bool: another one of its nuclide, beside it, would explain the counts better (`Sources`)
 
 
 @pytree
@@ -313,6 +314,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         detection=detection,
         effective_samples=jnp.nan_to_num(posterior.effective),
         converged=converged,
+        joined=s.joined,
     )
     order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))
 

@@ -34,6 +34,7 @@ TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wr
 MOST_TOLERANT = 0.5
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
+ONE_M = 3.0  # within it two sources of one nuclide are told as one
 
 
 @pytree
@@ -58,6 +59,7 @@ class Sources:
     present: jax.Array  # [K] bool
     nuclide_value: jax.Array  # [K, N] logarithm of the posterior of each nuclide at its place
     towards: jax.Array  # [K, 3, 3] information about its place (`Settled.towards`)
+    joined: jax.Array  # [K] bool, whether another one of its nuclide stood beside it and was taken away
 
 
 @pytree
@@ -89,6 +91,7 @@ def no_sources(problem: Problem, count: int, nuclides: int) -> State:
             present=jnp.zeros(count, bool),
             nuclide_value=jnp.zeros((count, nuclides)),
             towards=jnp.zeros((count, 3, 3)),
+            joined=jnp.zeros(count, bool),
         ),
         added=Others(
             counts=jnp.zeros((count, *problem.background.shape)), variance=jnp.zeros((count, len(problem.background)))
@@ -126,6 +129,7 @@ class _Progress:
     before: State
     over: jax.Array  # [] bool
     left: jax.Array  # [] int32, seeks at most
+    closing: jax.Array  # [] bool, whether companions have been joined: no more sources are added
 
 
 def find_sources(
@@ -134,7 +138,8 @@ def find_sources(
     """Seek the sources of ``state`` again, then add others until no further one explains the counts beyond chance.
 
     After each that is added the others are sought again. Then the one that is missed least is left out for a trial: the
-    first source found between two others is none, and the others, sought again, explain the counts as well.
+    first source found between two others is none, and the others, sought again, explain the counts as well. In the end
+    those that stand beside a stronger one of their nuclide are taken away (`Sources.joined`).
 
     Args:
         problem: the data.
@@ -143,11 +148,12 @@ def find_sources(
         params: settings.
         state: what is known already (`no_sources`).
     """
+    state = replace(state, sources=replace(state.sources, joined=jnp.zeros_like(state.sources.present)))
     first = settled(problem, replace(state, added=signals(problem, state.sources, state.unknowns.lengths)))
     no = jnp.array(False)
     start = _Progress(
         state=first, again=first.sources.present, wide=~no, trial=no, before=first, over=no,
-        left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max),
+        left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max), closing=no,
     )  # fmt: skip
 
     def step(p: _Progress) -> _Progress:
@@ -160,15 +166,39 @@ def find_sources(
         done = ~jnp.any(again) & (found | ~adding)
         wide = p.wide & jnp.any(again) & ~adding
         p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
-        untried = done & ~p.trial & (jnp.sum(present) >= 2)
+        untried = done & ~p.trial & ~p.closing & (jnp.sum(present) >= 2)
         p = _ended_trial(params.further, p, done & p.trial)
         p = _begun_trial(problem, params, p, untried)
-        full = jnp.all(p.state.sources.present) & ~jnp.any(p.again)
-        return replace(p, over=p.over | full | (p.left <= 0))
+        full = (jnp.all(p.state.sources.present) | p.closing) & ~jnp.any(p.again)
+        return _joined(problem, replace(p, over=p.over | full | (p.left <= 0)))
 
     end = repeat_while(lambda p: ~p.over, step, start)
     # a trial that found no end has shown nothing
     return jax.tree.map(partial(jnp.where, end.trial), end.before, end.state)
+
+
+def _joined(problem: Problem, p: _Progress) -> _Progress:
+    """At the end: sources beside a stronger one of their nuclide are taken away, and those that are left sought again.
+
+    So close by, two of a nuclide are rather one whose walls are others than presumed. While others were sought they
+    took up what the model does not explain.
+    """
+    s = p.state.sources
+    apart = jnp.linalg.norm(s.place[:, None, :2] - s.place[:, :2], axis=-1)
+    beside = (apart < ONE_M) & (s.nuclide[:, None] == s.nuclide) & s.present[:, None] & s.present
+    beside &= s.activity_bq[:, None] < s.activity_bq  # [weaker, stronger]
+    companion = jnp.any(beside, axis=1)
+    now = p.over & ~p.closing & ~p.trial & jnp.any(companion)
+
+    def join() -> _Progress:
+        left = s.present & ~companion
+        sources = replace(s, present=left, joined=jnp.any(beside, axis=0) & left)
+        added = replace(p.state.added, counts=jnp.where(companion[:, None, None], 0.0, p.state.added.counts))
+        state = settled(problem, replace(p.state, sources=sources, added=added))
+        yes = jnp.array(True)
+        return replace(p, state=state, again=left, over=~yes, closing=yes, left=p.left + left.shape[0])
+
+    return for_those(now, join, lambda: p)
 
 
 def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.Array) -> _Progress:

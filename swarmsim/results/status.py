@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from swarmsim.estimation.sources import ONE_M
 from swarmsim.results.record import Estimate, RadiationMap, Samples
 
 Floats = NDArray[np.floating]
@@ -27,7 +28,6 @@ FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
 COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
 COMPANION_SHARE = 0.25  # of the stronger one's activity
-ONE_M = 3.0  # within it two sources of whatever activities may be one that walls blur
 IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from swarmsim.config.mission import Knowledge
-from swarmsim.estimation.localise import sampled
+from swarmsim.estimation.localise import problem_of, sampled
 from swarmsim.estimation.posterior import Posterior
-from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
+from swarmsim.estimation.sources import _joined, _Progress, signals
+from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE, SPANS
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
 pytestmark = pytest.mark.optimised
@@ -105,6 +106,30 @@ def test_two_sources_of_different_nuclides_are_both_found(localiser, seed):
         assert np.all(np.abs(deviations(estimated.fits, *truth[name], k)) < 4.0)
         assert float(estimated.fits.detection[k]) > float(localiser.params.search.threshold)
     assert float(estimated.fits.detection[0]) >= float(estimated.fits.detection[1])
+
+
+@pytest.mark.parametrize(
+    ("apart", "nuclides", "joined"), [(2.0, (0, 0), True), (4.0, (0, 0), False), (2.0, (0, 1), False)]
+)
+def test_two_of_a_nuclide_side_by_side_are_told_as_one(localiser, apart, nuclides, joined):
+    """The weaker one is taken away, and the other sought again; but not where it is another, or farther off."""
+    problem = problem_of(localiser.presumed, drawn(BOTH, mean_rois(SITE, DETECTORS, BOTH, CO_60), 3), SPANS)
+    sources = replace(
+        localiser.nothing.sources, present=jnp.array([True, True]), nuclide=jnp.array(nuclides),
+        place=jnp.array([[12.0, 4.0, 1.0], [12.0 + apart, 4.0, 1.0]]), activity_bq=jnp.array([1e8, 2e8]),
+    )  # fmt: skip
+    added = signals(problem, sources, localiser.nothing.unknowns.lengths)
+    state = replace(localiser.nothing, sources=sources, added=added)
+    no = jnp.array(False)
+    end = _Progress(
+        state=state, again=jnp.zeros(2, bool), wide=no, trial=no, before=state, over=~no, left=jnp.int32(0), closing=no
+    )
+    after = _joined(problem, end)
+    assert after.state.sources.present.tolist() == [not joined, True]
+    assert after.state.sources.joined.tolist() == [False, joined]
+    assert (bool(after.over), bool(after.closing)) == (not joined, joined)
+    assert after.again.tolist() == [False, joined]
+    assert float(jnp.max(jnp.abs(after.state.added.counts[0]))) == 0.0 or not joined
 
 
 def test_no_more_sources_are_found_than_there_is_room_for(localiser):

@@ -44,6 +44,14 @@ def test_a_spectrum_that_names_it_says_how_well():
     assert "fits the spectrum badly (p = 1e-05)" in finding(SURE, ONE, spectrum(named, 1e-5), False, False)
 
 
+def test_a_source_that_may_be_several_is_told_so():
+    joined = (replace(estimate(), joined=True),)
+    assert "m (or several within 3 m, or behind other walls than presumed); " in finding(
+        SURE, joined, None, False, False
+    )
+    assert "several" not in finding(SURE, ONE, None, False, False)
+
+
 def test_certainty_is_never_stated():
     sure = replace(spectrum(ONE[0].nuclide), confidence=0.99999)
     assert finding(SURE, ONE, sure, False, False).endswith("; identified with more than 99.9%")
