@@ -14,6 +14,7 @@ import csv
 import json
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -82,13 +83,9 @@ def _detectable(simulation: Any, batch: Any) -> list[np.ndarray]:
         measurements, spans = gathered(world, plan, windows, key)
         problem = problem_of(plan.presumed, measurements, spans)
         state = no_sources(problem, place.shape[0], plan.presumed.nuclides.shape[0])
-        sources = state.sources.__class__(
-            place=place, nuclide=nuclide, activity_bq=activity, present=activity > 0.0,
-            nuclide_value=state.sources.nuclide_value, towards=state.sources.towards,
-        )  # fmt: skip
+        sources = replace(state.sources, place=place, nuclide=nuclide, activity_bq=activity, present=activity > 0.0)
         added = signals(problem, sources, state.unknowns.lengths)
-        true = state.__class__(sources=sources, added=added, unknowns=state.unknowns, likelihood=state.likelihood)
-        return ratios(problem, settled(problem, true))
+        return ratios(problem, settled(problem, replace(state, sources=sources, added=added)))
 
     found = []
     for i, seed in enumerate(np.asarray(batch.seeds)[: len(batch.seeds)]):
