@@ -167,7 +167,9 @@ def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
         faint, strong = sorted(pair, key=lambda one: one.activity_mbq)
         apart = float(np.linalg.norm(np.asarray(faint.position_m)[:2] - np.asarray(strong.position_m)[:2]))
         share = faint.activity_mbq / max(strong.activity_mbq, 1e-12)
-        if faint.nuclide == strong.nuclide and apart < (COMPANION_M if share < COMPANION_SHARE else ONE_M):
+        alike = faint.nuclide == strong.nuclide and apart < (COMPANION_M if share < COMPANION_SHARE else ONE_M)
+        # what the model does not explain about a source is taken up by others near it, of any nuclide
+        if alike or (strong.joined and apart < COMPANION_M):
             other = "a stronger one" if share < 1.0 else "another one"
             text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
             found.append(("ambiguous", f"{text} may be an error of the model"))

@@ -74,6 +74,11 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"hotspots": ((0.0, 0.0), (-28.0, 0.0))}, "ambiguous", "further sources"),
         ({"final": (estimate(), estimate(6.0, activity=20.0))}, "ambiguous", "20 MBq 6 m beside a stronger one"),
         ({"final": (estimate(), estimate(0.3, activity=95.0))}, "ambiguous", "95 MBq 0.3 m beside a stronger one"),
+        (
+            {"final": (replace(estimate(), joined=True), estimate(8.0, activity=90.0))},
+            "ambiguous",
+            "8 m beside a stronger",
+        ),
         ({"final": (estimate(), estimate(0.3))}, "ambiguous", "0.3 m beside another one"),
         (
             {"final": (estimate(), estimate(9.0, activity=0.02, nuclide="I-131"))},
