@@ -25,7 +25,7 @@ import numpy as np
 
 import swarmsim
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.sources import no_sources, ratios, settled, signals
+from swarmsim.estimation.state import no_sources, ratios, settled, signals
 from swarmsim.missions.knowledge import gathered
 from swarmsim.results.record import Estimate, MissionRecord, TrueSource
 from swarmsim.site.model import height_at

@@ -17,7 +17,8 @@ from swarmsim.estimation.forward import Problem, Span, nodes_of, padded, trust_o
 from swarmsim.estimation.likelihood import natural_background, position_covariance
 from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.posterior import Posterior, posteriors
-from swarmsim.estimation.sources import SearchParams, Sources, State, find_sources, no_sources, ratios
+from swarmsim.estimation.sources import SearchParams, find_sources
+from swarmsim.estimation.state import Sources, State, no_sources, ratios
 from swarmsim.pytree import on_host, pytree, static
 from swarmsim.radiation.coarse import coarse
 from swarmsim.radiation.detector import AIR, Detector

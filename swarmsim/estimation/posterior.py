@@ -28,7 +28,8 @@ from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, normal_equations
 from swarmsim.estimation.search import TOGETHER, attempt, bounds, screen_of, screened, spread
-from swarmsim.estimation.sources import ALONE_STEPS, State, as_known, without
+from swarmsim.estimation.sources import as_known
+from swarmsim.estimation.state import ALONE_STEPS, State, without
 from swarmsim.pytree import pytree
 
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,

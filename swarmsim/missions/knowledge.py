@@ -16,7 +16,7 @@ from swarmsim.estimation import (
     localise,
 )
 from swarmsim.estimation.forward import Span, spans_of
-from swarmsim.estimation.sources import State
+from swarmsim.estimation.state import State
 from swarmsim.estimation.windows import Windows, measured, merged
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey

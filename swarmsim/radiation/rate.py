@@ -273,8 +273,8 @@ def roi_rates_and_slopes(
     # most nuclides have fewer lines than the tables have rows
     count = jnp.max(jnp.where(detector.yields[source.nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
     n, regions = axis.shape[0], detector.peak_rois.shape[-1]
-    sums = n // places
-    nothing = RoiRates(jnp.zeros((sums, regions)), jnp.zeros((sums, len(by), regions)), jnp.zeros(n))
+    m = n // places
+    nothing = RoiRates(jnp.zeros((m, regions)), jnp.zeros((m, len(by), regions)), jnp.zeros(n))
 
     def add(number: jax.Array, sums: RoiRates) -> RoiRates:
         return jax.tree.map(jnp.add, sums, of(jax.tree.map(lambda x: x[number], lines)))

@@ -8,7 +8,7 @@ import pytest
 
 from swarmsim.estimation import concatenate, localisation_params, localise
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.sources import no_sources
+from swarmsim.estimation.state import no_sources
 from tests.estimation.survey import NUCLIDES, counted, orbit, place, presumed, spec, spectrometer, survey
 
 DETECTORS = (spectrometer(), spectrometer("nai_2x2"))

@@ -10,7 +10,8 @@ import pytest
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.localise import problem_of, sampled
 from swarmsim.estimation.posterior import Posterior
-from swarmsim.estimation.sources import _joined, _Progress, signals
+from swarmsim.estimation.sources import _joined, _Progress
+from swarmsim.estimation.state import signals
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE, SPANS
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 

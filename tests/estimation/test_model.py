@@ -24,7 +24,7 @@ from swarmsim.estimation.forward import (
 )
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.scan import scan
-from swarmsim.estimation.sources import no_sources
+from swarmsim.estimation.state import no_sources
 from swarmsim.radiation import observed_rate
 from tests.estimation.survey import NUCLIDES, counted, mean_rois, place, presumed, spectrometer, survey, windows
 

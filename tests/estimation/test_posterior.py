@@ -26,7 +26,7 @@ from swarmsim.estimation.posterior import (
     sample_posterior,
 )
 from swarmsim.estimation.search import attempt
-from swarmsim.estimation.sources import Sources, no_sources
+from swarmsim.estimation.state import Sources, no_sources
 from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
 
 AT, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6

@@ -13,7 +13,7 @@ from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.measurements import concatenate
 from swarmsim.estimation.search import Tried, attempt, spread_along
-from swarmsim.estimation.sources import no_sources
+from swarmsim.estimation.state import no_sources
 from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spectrometer, survey
 
 CO_60 = jnp.int32(NUCLIDES.index("Co-60"))

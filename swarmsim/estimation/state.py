@@ -1,0 +1,108 @@
+"""The sources that an estimate has found so far, and the fit of all of them together."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from swarmsim.device import for_those
+from swarmsim.estimation.fit import without_more
+from swarmsim.estimation.forward import Problem, rates, variance_of, ways_from
+from swarmsim.estimation.normal_equations import Others, Unknowns, nothing_known
+from swarmsim.pytree import pytree
+
+ALONE_STEPS = 4  # Gauss-Newton steps without a further source
+
+
+@pytree
+class Sources:
+    """Sources found; K places for them."""
+
+    place: jax.Array  # [K, 3] x, y, height above the ground
+    nuclide: jax.Array  # [K] int32
+    activity_bq: jax.Array  # [K]
+    present: jax.Array  # [K] bool
+    nuclide_value: jax.Array  # [K, N] logarithm of the posterior of each nuclide at its place
+    towards: jax.Array  # [K, 3, 3] information about its place (`Settled.towards`)
+    joined: jax.Array  # [K] bool, whether another one of its nuclide stood beside it and was taken away
+
+
+@pytree
+class State:
+    """Sources, and the fit of all of them."""
+
+    sources: Sources
+    added: Others  # what they add; nothing for those that are not there
+    unknowns: Unknowns  # its own activity is zero: that of the sources stands there
+    likelihood: jax.Array  # []
+
+
+def no_sources(problem: Problem, count: int, nuclides: int) -> State:
+    """Nothing found yet."""
+    zero = jnp.zeros(count)
+    return State(
+        sources=Sources(
+            place=jnp.zeros((count, 3)).at[:, 2].set(problem.height_m),
+            nuclide=jnp.zeros(count, jnp.int32),
+            activity_bq=zero,
+            present=jnp.zeros(count, bool),
+            nuclide_value=jnp.zeros((count, nuclides)),
+            towards=jnp.zeros((count, 3, 3)),
+            joined=jnp.zeros(count, bool),
+        ),
+        added=Others(
+            counts=jnp.zeros((count, *problem.background.shape)), variance=jnp.zeros((count, len(problem.background)))
+        ),
+        unknowns=nothing_known(problem, count),
+        likelihood=-jnp.asarray(jnp.inf),
+    )
+
+
+def signals(problem: Problem, s: Sources, lengths: jax.Array) -> Others:
+    """What the sources add; nothing for those that are not there."""
+
+    def one(x: tuple[jax.Array, jax.Array, jax.Array, jax.Array]) -> Others:
+        place, nuclide, activity, there = x
+        n, regions = problem.background.shape
+
+        def seen() -> Others:
+            ways = ways_from(problem, place)
+            found = rates(problem, ways, nuclide, lengths)
+            return Others(counts=activity * found.counts, variance=variance_of(problem, ways.position_m) + found.edge)
+
+        return for_those(there, seen, lambda: Others(counts=jnp.zeros((n, regions)), variance=jnp.zeros(n)))
+
+    return jax.lax.map(one, (s.place, s.nuclide, s.activity_bq, s.present))
+
+
+def without(state: State, k: jax.Array) -> State:
+    """The state without source ``k``, nothing fitted anew."""
+    present = state.sources.present.at[k].set(False)
+    added = replace(state.added, counts=state.added.counts.at[k].set(0.0))
+    return replace(state, sources=replace(state.sources, present=present), added=added)
+
+
+def settled(problem: Problem, state: State) -> State:
+    """The state with all unknowns but the places fitted."""
+    u, likelihood = without_more(problem, state.added, state.unknowns, ALONE_STEPS)
+    sources = replace(state.sources, activity_bq=state.sources.activity_bq * u.others)
+    added = replace(state.added, counts=state.added.counts * u.others[:, None, None])
+    return State(sources=sources, added=added, unknowns=shared(u), likelihood=likelihood)
+
+
+def shared(u: Unknowns) -> Unknowns:
+    """The unknowns with what they say of sources taken over by these."""
+    return replace(u, activity_bq=jnp.zeros(()), others=jnp.ones_like(u.others))
+
+
+def ratios(problem: Problem, state: State) -> jax.Array:
+    """Twice the logarithm of the likelihood ratio [K] against the same without each source, the other places held."""
+
+    def one(k: jax.Array) -> jax.Array:
+        def look() -> jax.Array:
+            rest = without(state, k).added
+            return 2.0 * (state.likelihood - without_more(problem, rest, state.unknowns, ALONE_STEPS)[1])
+
+        return for_those(state.sources.present[k], look, lambda: jnp.zeros(()))
+
+    return jax.lax.map(one, jnp.arange(state.sources.present.shape[0]))
