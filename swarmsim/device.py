@@ -14,8 +14,10 @@ from jax.extend import core
 In = TypeVar("In")
 Out = TypeVar("Out")
 
-AT_A_TIME = 32  # missions for which an accelerator computes what only some of them need: each is much by itself
+AT_A_TIME = 64  # missions for which an accelerator computes what only some of them need: each is much by itself
+IN_STEP = 512  # missions that wait for one another, where what takes long is asked for inside, by `for_those` again
 
+_ASKED: ContextVar[jax.Array | None] = ContextVar("swarmsim asked", default=None)
 _CORES: ContextVar[str | None] = ContextVar("swarmsim cores", default=None)
 
 
@@ -100,59 +102,118 @@ def switch(number: jax.Array, branches: Sequence[Callable[[], Out]]) -> Out:
     return jax.tree.map(lambda *leaves: jax.lax.select_n(number, *leaves), *(branch() for branch in branches))
 
 
-def for_those(predicate: jax.Array, one: Callable[[], Out], other: Callable[[], Out]) -> Out:
+def for_those(
+    predicate: jax.Array, one: Callable[[], Out], other: Callable[[], Out], together: int | None = None
+) -> Out:
     """The result of ``one`` where ``predicate`` [] holds, else that of ``other``, which costs next to nothing.
 
     Unlike `either` it is for what takes long and few missions need at a time: an accelerator computes ``one`` for those
-    that need it alone, `AT_A_TIME` together. What is computed so cannot be differentiated in reverse.
+    that need it alone, ``together`` at a time (static; `AT_A_TIME` by default). What is computed so cannot be
+    differentiated in reverse.
+
+    Inside, missions that fill up a group ask for nothing. So ``one`` may be computed for many at a time (`IN_STEP`)
+    whose number falls, if all that takes long in it is in `for_those` or `repeat_while` again, of which the groups are
+    full whenever there are enough missions that need it.
     """
     if on_processor():
         return jax.lax.cond(predicate, one, other)
-    closed, shapes = jax.make_jaxpr(one, return_shape=True)()
+
+    def asked(yes: jax.Array) -> Out:
+        token = _ASKED.set(yes)
+        try:
+            return one()
+        finally:
+            _ASKED.reset(token)
+
+    closed, shapes = jax.make_jaxpr(asked, return_shape=True)(jax.ShapeDtypeStruct((), bool))
     structure: Any = jax.tree.structure(shapes)
     least, found = jax.tree.flatten(other())
     if structure != found:
         raise TypeError(f"the results differ in structure: {structure} and {found}")
     leaves = [jnp.asarray(x, aval.dtype) for x, aval in zip(least, closed.out_avals, strict=True)]
 
-    def evaluate(*consts: Any) -> list[jax.Array]:
-        return list(core.jaxpr_as_fun(core.ClosedJaxpr(closed.jaxpr, consts))())
+    def evaluate(yes: jax.Array, *consts: Any) -> list[jax.Array]:
+        return list(core.jaxpr_as_fun(core.ClosedJaxpr(closed.jaxpr, consts))(yes))
 
-    return jax.tree.unflatten(structure, _chosen(evaluate, jnp.asarray(predicate, bool), leaves, closed.consts))
+    chosen = _chosen(evaluate, _asked(predicate), leaves, closed.consts, together or AT_A_TIME)
+    return jax.tree.unflatten(structure, chosen)
 
 
-def repeat_while(more: Callable[[Out], jax.Array], step: Callable[[Out], Out], start: Out) -> Out:
-    """`jax.lax.while_loop`, of which an accelerator computes a ``step`` for the missions that go on alone."""
+def _asked(predicate: jax.Array) -> jax.Array:
+    """Whether [] it holds, for a mission that is asked."""
+    asked, predicate = _ASKED.get(), jnp.asarray(predicate, bool)
+    return predicate if asked is None else predicate & asked
+
+
+def some_at_a_time(function: Callable[[], Out]) -> Out:
+    """The result of ``function``; on an accelerator for `AT_A_TIME` missions at a time, inside `for_those`.
+
+    Missions that are not asked get zeros.
+    """
+    if on_processor():
+        return function()
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function))
+    return for_those(jnp.array(True), function, lambda: nothing)
+
+
+@custom_vmap
+def at_most(x: jax.Array) -> jax.Array:
+    """``x`` [] or more: what is computed for many at a time gets the largest of theirs.
+
+    A loop with so many steps ends at the same one for all, and need not keep the results of those that ended before.
+    """
+    return x
+
+
+@at_most.def_vmap
+def _at_most_of_all(size: int, own: Any, x: jax.Array) -> tuple[jax.Array, bool]:
+    del size
+    return at_most(jnp.max(x) if own[0] else x), False
+
+
+def repeat_while(
+    more: Callable[[Out], jax.Array], step: Callable[[Out], Out], start: Out, together: int | None = None
+) -> Out:
+    """`jax.lax.while_loop`, of which an accelerator computes a ``step`` for the missions that go on alone.
+
+    ``together`` is that of `for_those`.
+    """
     if on_processor():
         return jax.lax.while_loop(more, step, start)
-    return jax.lax.while_loop(more, lambda x: for_those(more(x), lambda: step(x), lambda: x), start)
+
+    def on(x: Out) -> jax.Array:
+        return _asked(more(x))
+
+    return jax.lax.while_loop(on, lambda x: for_those(on(x), lambda: step(x), lambda: x, together), start)
 
 
 def _chosen(
-    evaluate: Callable[..., list[jax.Array]], predicate: jax.Array, other: list[jax.Array], consts: Sequence[Any]
-) -> list[jax.Array]:
-    """``evaluate(*consts)`` where ``predicate`` [] holds, else ``other``."""
+    evaluate: Callable[..., list[jax.Array]], predicate: jax.Array, other: list[jax.Array], consts: Sequence[Any],
+    together: int,
+) -> list[jax.Array]:  # fmt: skip
+    """``evaluate(True, *consts)`` where ``predicate`` [] holds, else ``other``; ``together`` at a time."""
+    yes = jnp.array(True)
 
     @custom_vmap
     def chosen(predicate: jax.Array, other: list[jax.Array], consts: list[Any]) -> list[jax.Array]:
-        return jax.lax.cond(predicate, lambda: evaluate(*consts), lambda: other)
+        return jax.lax.cond(predicate, lambda: evaluate(yes, *consts), lambda: other)
 
     @chosen.def_vmap
     def of_many(size: int, own: Any, predicate: jax.Array, other: list[jax.Array], consts: list[Any]) -> Any:
         apart, own_other, own_consts = own
         if not (apart or any(own_other) or any(own_consts)):  # JAX asks so for a derivative's sake
-            return jax.lax.cond(predicate, lambda: evaluate(*consts), lambda: other), [False] * len(other)
+            return jax.lax.cond(predicate, lambda: evaluate(yes, *consts), lambda: other), [False] * len(other)
         axes = [0 if x else None for x in own_consts]
         other = [x if y else _repeated(x, size) for x, y in zip(other, own_other, strict=True)]
         every = [True] * len(other)
         if apart:
-            return _in_groups(evaluate, predicate, other, consts, axes), every
+            return _in_groups(evaluate, predicate, other, consts, axes, together), every
 
-        def alike(*consts: Any) -> list[jax.Array]:
-            return [_repeated(x, size) for x in evaluate(*consts)]
+        def alike(asked: jax.Array, *consts: Any) -> list[jax.Array]:
+            return [_repeated(x, size) for x in evaluate(asked, *consts)]
 
-        many = jax.vmap(evaluate, in_axes=axes, axis_size=size) if any(own_consts) else alike
-        return _chosen(many, predicate, other, consts), every
+        many = jax.vmap(evaluate, in_axes=[None, *axes], axis_size=size) if any(own_consts) else alike
+        return _chosen(many, predicate, other, consts, together), every
 
     return chosen(predicate, other, list(consts))
 
@@ -167,22 +228,30 @@ def _in_groups(
     other: list[jax.Array],
     consts: list[Any],
     axes: list[int | None],
+    most: int,
 ) -> list[jax.Array]:
     """``other`` [B, ...] with the results for those where ``predicate`` [B] holds, a group of them after another."""
     size = predicate.shape[0]
-    group = min(AT_A_TIME, size)
+    group = min(most, size)
+    together = jax.vmap(evaluate, in_axes=[0, *axes], axis_size=group)
+    if group == size and most > AT_A_TIME:  # what takes long is asked for inside
+        found = together(predicate, *consts)
+        return [jnp.where(_over(predicate, y), y, x) for x, y in zip(other, found, strict=True)]
     count = jnp.sum(predicate)
     order = jnp.append(jnp.argsort(~predicate, stable=True), jnp.zeros(group, jnp.int32))
-    together = jax.vmap(evaluate, in_axes=axes, axis_size=group)
 
     def take(number: jax.Array, results: list[jax.Array]) -> list[jax.Array]:
         at = jax.lax.dynamic_slice(order, (number * group,), (group,))
         asked = number * group + jnp.arange(group) < count
-        # What fills the last group up is the first of it again: another one's state may be one that no loop ends from,
-        # and what it asks for inside would be computed too.
+        # What fills the last group up is the first of it again: another one's state may be one that no loop ends from.
         at = jnp.where(asked, at, at[0])
-        found = together(*[x if axis is None else x[at] for x, axis in zip(consts, axes, strict=True)])
+        found = together(asked, *[x if axis is None else x[at] for x, axis in zip(consts, axes, strict=True)])
         rows = jnp.where(asked, at, size)  # the rest is dropped
         return [x.at[rows].set(y, mode="drop") for x, y in zip(results, found, strict=True)]
 
     return jax.lax.fori_loop(0, -(-count // group), take, other)
+
+
+def _over(predicate: jax.Array, x: jax.Array) -> jax.Array:
+    """The predicate [B] for every entry of ``x`` [B, ...]."""
+    return predicate.reshape(-1, *[1] * (x.ndim - 1))

@@ -114,3 +114,43 @@ def test_missions_repeat_as_often_as_each_of_them_goes_on(processor, monkeypatch
         for k in range(n):
             x = x * f + k
         assert float(value) == pytest.approx(x, rel=1e-6)
+
+
+def test_groups_inside_are_full_whoever_went_on_before(monkeypatch):
+    """Seven missions in step, three at a time where it takes long: as many groups as those that still go on need."""
+    monkeypatch.setattr(device, "on_processor", lambda: False)
+    monkeypatch.setattr(device, "AT_A_TIME", 3)
+    groups: list[int] = []
+    wanted = jnp.array([True, True, False, True, True, True, True])
+    passes = jnp.array([4, 1, 10**7, 2, 4, 4, 1])
+
+    def one(wanted, passes, x):
+        def long(carry):
+            k, x = carry
+            jax.debug.callback(lambda k: groups.append(int(k)), k)
+            return k + 1, x + device.some_at_a_time(lambda: 1.0 * x)
+
+        def all_():
+            return device.repeat_while(lambda carry: carry[0] < passes, long, (jnp.int32(0), x))[1]
+
+        return device.for_those(wanted, all_, lambda: -x, 7)
+
+    x = jnp.arange(1.0, 8.0)
+    found = jax.jit(jax.vmap(one))(wanted, passes, x)
+    jax.effects_barrier()
+    np.testing.assert_array_equal(found, np.where(wanted, x * 2.0 ** np.minimum(passes, 9), -x))
+    # six, four, three and three missions: 2 + 2 + 1 + 1 groups of three, each of which tells three times
+    assert len(groups) == 18
+    with_one = jax.jit(jax.vmap(lambda w, p, x: device.for_those(w, lambda: one(w, p, x), lambda: -x, 4)))
+    np.testing.assert_array_equal(with_one(wanted, passes, x), found)
+
+
+def test_most_of_all_missions_is_one_number():
+    def one(x):
+        count = device.at_most(x)
+        return jax.lax.fori_loop(0, count, lambda _, total: total + 1, 0)
+
+    np.testing.assert_array_equal(jax.jit(jax.vmap(one))(jnp.array([2, 5, 3])), [5, 5, 5])
+    nested = jax.jit(jax.vmap(jax.vmap(one)))(jnp.array([[2, 1], [7, 3]]))
+    np.testing.assert_array_equal(nested, np.full((2, 2), 7))
+    assert int(jax.jit(one)(4)) == 4

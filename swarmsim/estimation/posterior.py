@@ -22,7 +22,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import each, for_those, repeat_while
+from swarmsim.device import IN_STEP, each, for_those, repeat_while, some_at_a_time
 from swarmsim.estimation.fit import alone, settle
 from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
@@ -291,7 +291,9 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> t
     def one(k: jax.Array) -> Posterior:
         zero = jnp.zeros(())
         nothing = Posterior(mean=jnp.zeros(4), covariance=jnp.eye(4), effective=zero, halves=zero)
-        return for_those(s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing)
+        return for_those(
+            s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing, IN_STEP
+        )  # fmt: skip
 
     return jax.lax.map(one, jnp.arange(s.present.shape[0])), goodness(problem, state)
 
@@ -316,7 +318,8 @@ def _posterior(problem: Problem, state: State, k: jax.Array, rounds: int, per_ro
     known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
     known = known.at[2].set(height_precision(problem.height_std_m))
     covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
-    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, _modes(problem, state, k, others, u))
+    modes = some_at_a_time(lambda: _modes(problem, state, k, others, u))
+    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, modes)
 
 
 def _modes(problem: Problem, state: State, k: jax.Array, others: Others, u: Unknowns) -> jax.Array:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim.device import each
 from swarmsim.estimation.forward import Problem, detector_of, padded, silent
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations, of_window
 from swarmsim.pytree import on_device, pytree
@@ -49,7 +50,7 @@ def open_rates(detector: Detector, nuclides: int, air: int) -> jax.Array:
         source = Source(position_m=jnp.zeros(3), activity_bq=jnp.ones(()), nuclide=nuclide)
         return roi_rates_and_slopes(detector, source, way, place, up).rates * jnp.square(distance)[:, None]
 
-    return jax.lax.map(of, jnp.arange(nuclides))
+    return each(of, jnp.arange(nuclides), nuclides)
 
 
 def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Others, u: Unknowns) -> Scanned:

@@ -11,7 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import for_those, repeat_while, switch
+from swarmsim.device import IN_STEP, for_those, repeat_while, switch
 from swarmsim.estimation.fit import FLAT, Settled
 from swarmsim.estimation.forward import Problem, Rates, variance_of
 from swarmsim.estimation.likelihood import position_of
@@ -111,7 +111,7 @@ def find_sources(
         full = (jnp.all(p.state.sources.present) | p.closing) & ~jnp.any(p.again)
         return _joined(problem, replace(p, over=p.over | full | (p.left <= 0)))
 
-    end = repeat_while(lambda p: ~p.over, step, start)
+    end = repeat_while(lambda p: ~p.over, step, start, IN_STEP)
     # a trial that found no end has shown nothing
     return jax.tree.map(partial(jnp.where, end.trial), end.before, end.state)
 
@@ -198,7 +198,7 @@ def _sought(
         return jax.tree.map(partial(jnp.where, found), after, state), found
 
     worth = ~adding | (statistic > PROMISING * params.threshold)
-    return for_those(worth, look, lambda: (state, jnp.array(False)))
+    return for_those(worth, look, lambda: (state, jnp.array(False)), IN_STEP)
 
 
 def _best(

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.device import on_processor
+from swarmsim.device import at_most, on_processor
 from swarmsim.radiation.cylinder import NEAR_TABLES, direction_basis, near_ratio
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.lines import SPECTRUM_DEPTHS
@@ -25,6 +25,8 @@ from swarmsim.site.rays import Crossed
 
 INDOORS = 0.1
 """Sine of the elevation at which, in the open, as much comes from the ground as out of a building with thick walls."""
+LINES_TOGETHER = 2
+"""Of a nuclide, which an accelerator computes at a time."""
 HELD_BACK = 3.0
 """Depth of walls for the photons that the ground scatters, over that for those of the source."""
 
@@ -268,18 +270,26 @@ def roi_rates_and_slopes(
     def of(line: dict[str, Any]) -> RoiRates:
         return _of_line(replace(detector, **line), one, way, position_m, axis, by, given, places)
 
-    if not on_processor():
-        return RoiRates(*(jnp.sum(x, axis=0) for x in jax.vmap(of)(lines)))
+    n, regions = axis.shape[0], detector.peak_rois.shape[-1]
+    m, together = n // places, 1 if on_processor() else LINES_TOGETHER
     # most nuclides have fewer lines than the tables have rows
     count = jnp.max(jnp.where(detector.yields[source.nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
-    n, regions = axis.shape[0], detector.peak_rois.shape[-1]
-    m = n // places
     nothing = RoiRates(jnp.zeros((m, regions)), jnp.zeros((m, len(by), regions)), jnp.zeros(n))
 
     def add(number: jax.Array, sums: RoiRates) -> RoiRates:
-        return jax.tree.map(jnp.add, sums, of(jax.tree.map(lambda x: x[number], lines)))
+        if together == 1:
+            return jax.tree.map(jnp.add, sums, of(jax.tree.map(lambda x: x[number], lines)))
+        # a line without photons adds nothing
+        own = {name: _rows(x, number * together, together) for name, x in lines.items()}
+        return jax.tree.map(lambda old, new: old + jnp.sum(new, axis=0), sums, jax.vmap(of)(own))
 
-    return jax.lax.fori_loop(0, count, add, nothing)
+    return jax.lax.fori_loop(0, at_most(-(-count // together)), add, nothing)
+
+
+def _rows(x: jax.Array, first: jax.Array, count: int) -> jax.Array:
+    """Rows [count, ...] from the ``first`` on; zeros beyond the last one."""
+    padded = jnp.pad(x, [(0, -x.shape[0] % count)] + [(0, 0)] * (x.ndim - 1))
+    return jax.lax.dynamic_slice_in_dim(padded, first, count)
 
 
 _LINES = {

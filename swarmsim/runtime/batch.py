@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from swarmsim.device import among_cores, on_processor
+from swarmsim.device import IN_STEP, among_cores, on_processor
 from swarmsim.runtime.clock import Clock
 from swarmsim.runtime.programs import Program, prepare
 from swarmsim.scalars import Layout
 
 SMALL = 4096  # elements up to which an array carries the mission axis whether or not missions differ in it
 MANY_VEHICLES = 1024  # of all missions on a device
-TOGETHER = 512  # missions that an accelerator estimates in step; a processor core takes one, which fits its cache
+TOGETHER = IN_STEP  # missions that an accelerator estimates in step; a processor core takes one, which fits its cache
 
 
 def layout_for(vehicles: int) -> Layout:

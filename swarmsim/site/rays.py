@@ -32,6 +32,7 @@ from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
 NEIGHBOURS = 16  # segments that are intersected with the same clusters of boxes
 PAIRS = 128  # of a segment and a box, of which shares are computed at a time
+PAIRS_OF_MANY = 512  # the same of each of many places, on an accelerator
 CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
 LOW_M = 2.0  # height at which half of the ground is left of what a low source in a building sees of it
 _TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
@@ -287,7 +288,7 @@ def by_threads(site: Site, a: jax.Array, b: jax.Array, platform: str | None = No
     ways: Way = over_vehicles(one, (0, 0, None, None), platform=platform)(
         b, starts, needed, (above.highest_m, above.around_m)
     )
-    return shaped(site.obstacles, of_metre, starts, b, ways)
+    return shaped(site.obstacles, of_metre, starts, b, ways, PAIRS_OF_MANY)
 
 
 @pytree

@@ -10,6 +10,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim.device import at_most
 from swarmsim.pytree import pytree
 from swarmsim.site.model import Obstacles, Site
 from swarmsim.site.surfaces import Box
@@ -143,14 +144,13 @@ def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size:
     n, place = wanted.shape[0], jnp.cumsum(wanted.astype(jnp.int32)) - 1
     size = min(size, n)
     rows = jnp.zeros(n + size, jnp.int32).at[jnp.where(wanted, place, n + size)].set(jnp.arange(n), mode="drop")
-    found = jnp.zeros((OUTPUTS + 3, n + size))
 
-    def step(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        first, found = carry
+    def step(number: jax.Array, found: jax.Array) -> jax.Array:
+        first = number * size
         own = function(jax.lax.dynamic_slice(rows, (first,), (size,)))
-        return first + size, jax.lax.dynamic_update_slice(found, own, (jnp.zeros_like(first), first))
+        return jax.lax.dynamic_update_slice(found, own, (jnp.zeros_like(first), first))
 
-    _, found = jax.lax.while_loop(lambda carry: carry[0] <= place[-1], step, (jnp.zeros((), jnp.int32), found))
+    found = jax.lax.fori_loop(0, at_most(-(-(place[-1] + 1) // size)), step, jnp.zeros((OUTPUTS + 3, n + size)))
     return found[:, jnp.maximum(place, 0)]
 
 
