@@ -75,7 +75,7 @@ def without_sources(mission: str, settings: list[str]) -> list[str]:
 
 
 def _detectable(simulation: Any, batch: Any) -> list[np.ndarray]:
-    """For each mission the likelihood ratio [S] of every true source, all of them at their true places."""
+    """For each mission the likelihood ratio of every true source, in their order, all of them at their true places."""
     plan, world, site = simulation.plan, simulation.world, simulation.site_model.site
 
     @jax.jit
@@ -95,9 +95,9 @@ def _detectable(simulation: Any, batch: Any) -> list[np.ndarray]:
         place[:, 2] -= height_at(site, position[:, :2])
         windows = jax.tree.map(lambda x, i=i: jnp.asarray(np.asarray(x)[i]), batch.end.windows)
         key = jax.random.key(int(seed))
-        found.append(np.asarray(
-            of(windows, key, plan, jnp.float32(place), jnp.asarray(sources.nuclide), jnp.asarray(sources.activity_bq))
-        ))  # fmt: skip
+        activity = np.asarray(sources.activity_bq)
+        ratio = of(windows, key, plan, jnp.float32(place), jnp.asarray(sources.nuclide), jnp.asarray(activity))
+        found.append(np.asarray(ratio)[activity > 0.0])
     return found
 
 
@@ -109,7 +109,7 @@ def rows_of(record: MissionRecord, ratio: np.ndarray, asked: tuple[float, float]
     """
     active = record.sources
     least = asked[len(active) > 1]
-    seen = [float(r) for r in ratio if r != 0.0][: len(active)] + [0.0] * len(active)
+    seen = [float(r) for r in ratio] + [0.0] * len(active)
     matched = matches(active, record.estimates)
     rows = []
     for number, source in enumerate(active):

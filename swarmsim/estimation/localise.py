@@ -83,7 +83,7 @@ class SourceFits:
     detection: jax.Array  # [K] twice the logarithm of the likelihood ratio against the same without it
     effective_samples: jax.Array  # [K] number of independent places that the posterior's weighted ones are worth
     converged: jax.Array  # [K] bool: those are enough, and two halves of them agree
-    joined: jax.Array  # [K] bool: another one of its nuclide, beside it, would explain the counts better (`Sources`)
+    joined_m: jax.Array  # [K] so far off another one of its nuclide would explain the counts better; 0: none
 
 
 @pytree
@@ -303,11 +303,13 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
     activity = jnp.exp(mean[:, 3])
 
     in_space = jax.vmap(partial(position_covariance, site))(mean, covariance)
+    # in which direction several would lie is hardly known
+    beside = jnp.square(s.beside_m)[:, None, None] * jnp.diag(jnp.array([1.0, 1.0, 0.0]))
     share = jax.nn.softmax(s.nuclide_value, axis=1)
     fits = SourceFits(
         present=s.present,
         position_m=mean[:, :3].at[:, 2].add(height),
-        covariance_m2=in_space + jnp.square(presumed.place_std_m) * jnp.eye(3),
+        covariance_m2=in_space + jnp.square(presumed.place_std_m) * jnp.eye(3) + beside,
         activity_bq=activity,
         activity_std_bq=activity * jnp.sqrt(log_variance),
         nuclide=s.nuclide,
@@ -315,7 +317,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         detection=detection,
         effective_samples=jnp.nan_to_num(posterior.effective),
         converged=converged,
-        joined=s.joined,
+        joined_m=s.joined_m,
     )
     order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))
 

@@ -16,6 +16,7 @@ from swarmsim.estimation.fit import FLAT, Settled
 from swarmsim.estimation.forward import Problem, Rates, variance_of
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.normal_equations import Others
+from swarmsim.estimation.pairs import divided, divisible, joined, strain
 from swarmsim.estimation.scan import scan, strongest
 from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
 from swarmsim.estimation.state import State, ratios, settled, shared, signals, without
@@ -28,13 +29,13 @@ AROUND = 1.5  # how far around a grid point, over the distance from one to the n
 REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; nuclides are compared in the second
 CLOSING = 0.55  # reach of a later round over that of the one before
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
-HOPELESS = 0.4  # of the threshold: the ratio at the best of the starts below which no further round is worth while
+HOPELESS = 0.4  # of the threshold: the ratio at the best of some starts below which no further round is worth while
 APART_M = 12.0  # between starts
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
-ONE_M = 3.0  # within it two sources of one nuclide are told as one
+DIVISIONS = 4  # of one into two, or of two into other two, at most
 
 
 @pytree
@@ -68,6 +69,7 @@ class _Progress:
     before: State
     over: jax.Array  # [] bool
     left: jax.Array  # [] int32, seeks at most
+    divisions: jax.Array  # [] int32, how often one may still be taken for two, or two be placed anew
     closing: jax.Array  # [] bool, whether companions have been joined: no more sources are added
 
 
@@ -78,7 +80,8 @@ def find_sources(
 
     After each that is added the others are sought again. Then the one that is missed least is left out for a trial: the
     first source found between two others is none, and the others, sought again, explain the counts as well. In the end
-    those that stand beside a stronger one of their nuclide are taken away (`Sources.joined`).
+    one is taken for two where that is what the counts ask for, and companions are taken away
+    (`swarmsim.estimation.pairs`).
 
     Args:
         problem: the data.
@@ -87,12 +90,14 @@ def find_sources(
         params: settings.
         state: what is known already (`no_sources`).
     """
-    state = replace(state, sources=replace(state.sources, joined=jnp.zeros_like(state.sources.present)))
+    s = state.sources
+    fresh = replace(s, joined_m=jnp.zeros_like(s.joined_m), beside_m=jnp.zeros_like(s.beside_m))
+    state = replace(state, sources=fresh)
     first = settled(problem, replace(state, added=signals(problem, state.sources, state.unknowns.lengths)))
     no = jnp.array(False)
     start = _Progress(
         state=first, again=first.sources.present, wide=~no, trial=no, before=first, over=no,
-        left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max), closing=no,
+        left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max), divisions=jnp.int32(DIVISIONS), closing=no,
     )  # fmt: skip
 
     def step(p: _Progress) -> _Progress:
@@ -109,33 +114,52 @@ def find_sources(
         p = _ended_trial(params.further, p, done & p.trial)
         p = _begun_trial(problem, params, p, untried)
         full = (jnp.all(p.state.sources.present) | p.closing) & ~jnp.any(p.again)
-        return _joined(problem, replace(p, over=p.over | full | (p.left <= 0)))
+        spent = p.left <= 0
+        # a trial that found no end has shown nothing
+        state = jax.tree.map(partial(jnp.where, spent & p.trial), p.before, p.state)
+        p = replace(p, state=state, trial=p.trial & ~spent, over=p.over | full | spent)
+        return _joined(problem, _divided(problem, params, p))
 
-    end = repeat_while(lambda p: ~p.over, step, start, IN_STEP)
-    # a trial that found no end has shown nothing
-    return jax.tree.map(partial(jnp.where, end.trial), end.before, end.state)
+    return repeat_while(lambda p: ~p.over, step, start, IN_STEP).state
+
+
+def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
+    """At the end: two sources in the place of one, or of two, if windows' rates depart from the model without that.
+
+    Both are sought again, and then tried as all others are.
+    """
+    sources = p.state.sources
+    open_ = p.over & ~p.closing & ~p.trial & (p.left > 0) & (p.divisions > 0)
+    now = open_ & divisible(sources) & (strain(problem, p.state) > params.further)
+
+    def divide() -> _Progress:
+        k, slot, ratio, two = divided(problem, p.state)
+        state, numbers = _with(problem, two.state, slot, two.second), jnp.arange(sources.present.shape[0])
+        table = state.sources.nuclide_value.at[slot].set(state.sources.nuclide_value[k])
+        state = replace(state, sources=replace(state.sources, nuclide_value=table))
+        both = (numbers == k) | (numbers == slot)
+        after = replace(p, state=state, again=both, over=jnp.array(False), divisions=p.divisions - 1)
+        better = ratio > HOPELESS * params.further
+        # what cannot be divided now cannot be later
+        return jax.tree.map(partial(jnp.where, better), after, replace(p, divisions=jnp.int32(0)))
+
+    return for_those(now, divide, lambda: p)
 
 
 def _joined(problem: Problem, p: _Progress) -> _Progress:
-    """At the end: sources beside a stronger one of their nuclide are taken away, and those that are left sought again.
+    """At the end: companions are taken away, and those that are left sought again.
 
-    So close by, two of a nuclide are rather one whose walls are others than presumed. While others were sought they
-    took up what the model does not explain.
+    While others were sought they took up what the model does not explain.
     """
-    s = p.state.sources
-    apart = jnp.linalg.norm(s.place[:, None, :2] - s.place[:, :2], axis=-1)
-    beside = (apart < ONE_M) & (s.nuclide[:, None] == s.nuclide) & s.present[:, None] & s.present
-    beside &= s.activity_bq[:, None] < s.activity_bq  # [weaker, stronger]
-    companion = jnp.any(beside, axis=1)
-    now = p.over & ~p.closing & ~p.trial & jnp.any(companion)
+    now = p.over & ~p.closing & ~p.trial
 
     def join() -> _Progress:
-        left = s.present & ~companion
-        sources = replace(s, present=left, joined=jnp.any(beside, axis=0) & left)
-        added = replace(p.state.added, counts=jnp.where(companion[:, None, None], 0.0, p.state.added.counts))
-        state = settled(problem, replace(p.state, sources=sources, added=added))
-        yes = jnp.array(True)
-        return replace(p, state=state, again=left, over=~yes, closing=yes, left=p.left + left.shape[0])
+        state, some = joined(problem, p.state)
+        left = state.sources.present
+        after = replace(
+            p, state=state, again=left, over=jnp.array(False), closing=jnp.array(True), left=p.left + left.shape[0]
+        )
+        return jax.tree.map(partial(jnp.where, some), after, p)
 
     return for_those(now, join, lambda: p)
 

@@ -24,7 +24,8 @@ class Sources:
     present: jax.Array  # [K] bool
     nuclide_value: jax.Array  # [K, N] logarithm of the posterior of each nuclide at its place
     towards: jax.Array  # [K, 3, 3] information about its place (`Settled.towards`)
-    joined: jax.Array  # [K] bool, whether another one of its nuclide stood beside it and was taken away
+    joined_m: jax.Array  # [K] how far off another one of its nuclide was that was taken away; 0: there was none
+    beside_m: jax.Array  # [K] root of the second moment of it and such others about their mean, by activity
 
 
 @pytree
@@ -48,7 +49,8 @@ def no_sources(problem: Problem, count: int, nuclides: int) -> State:
             present=jnp.zeros(count, bool),
             nuclide_value=jnp.zeros((count, nuclides)),
             towards=jnp.zeros((count, 3, 3)),
-            joined=jnp.zeros(count, bool),
+            joined_m=zero,
+            beside_m=zero,
         ),
         added=Others(
             counts=jnp.zeros((count, *problem.background.shape)), variance=jnp.zeros((count, len(problem.background)))

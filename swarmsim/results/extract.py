@@ -230,7 +230,7 @@ def _estimates(estimated: Estimated, nuclides: tuple[str, ...]) -> tuple[Estimat
             detection=float(fits.detection[k]),
             effective_samples=float(fits.effective_samples[k]),
             converged=bool(fits.converged[k]),
-            joined=bool(fits.joined[k]),
+            joined_m=float(fits.joined_m[k]),
         )
         for k in np.flatnonzero(np.asarray(fits.present))
     )

@@ -1,6 +1,7 @@
 """The sentence that says what a mission found, and why it is not to be believed where it is not."""
 
-from swarmsim.estimation.sources import ONE_M
+import math
+
 from swarmsim.results.record import Estimate, Spectrum
 from swarmsim.results.status import Verdict, in_mbq
 
@@ -44,11 +45,9 @@ def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool,
 def _placed(estimate: Estimate) -> str:
     x, y = estimate.position_m[:2]
     placed = f"{in_mbq(estimate.activity_mbq)} {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
-    return (
-        f"{placed} (or several within {ONE_M:.0f} m, or behind other walls than presumed)"
-        if estimate.joined
-        else placed
-    )
+    if estimate.joined_m <= 0.0:
+        return placed
+    return f"{placed} (or several within {math.ceil(estimate.joined_m)} m, or behind other walls than presumed)"
 
 
 def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str) -> str:

@@ -118,7 +118,7 @@ class Estimate:
     detection: float = np.inf  # twice the logarithm of the likelihood ratio against the same without it
     effective_samples: float = np.inf  # independent places that the posterior's weighted ones are worth
     converged: bool = True  # those are enough, and two halves of them agree
-    joined: bool = False  # another one of its nuclide within 3 m would explain the counts better
+    joined_m: float = 0.0  # so far off another one of its nuclide would explain the counts better; 0: none
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from swarmsim.estimation.sources import ONE_M
+from swarmsim.estimation.pairs import COMPANION_M, ONE_M
 from swarmsim.results.record import Estimate, RadiationMap, Samples
 
 Floats = NDArray[np.floating]
@@ -26,7 +26,6 @@ REACH_HEIGHTS = 1.0  # a measurement covers the ground around it up to its own h
 REACH_M = 8.0
 FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
-COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
 COMPANION_SHARE = 0.25  # of the stronger one's activity
 IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
@@ -169,7 +168,7 @@ def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
         share = faint.activity_mbq / max(strong.activity_mbq, 1e-12)
         alike = faint.nuclide == strong.nuclide and apart < (COMPANION_M if share < COMPANION_SHARE else ONE_M)
         # what the model does not explain about a source is taken up by others near it, of any nuclide
-        if alike or (strong.joined and apart < COMPANION_M):
+        if alike or (strong.joined_m > 0.0 and apart < COMPANION_M):
             other = "a stronger one" if share < 1.0 else "another one"
             text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
             found.append(("ambiguous", f"{text} may be an error of the model"))
@@ -207,13 +206,18 @@ def _unexplained(chart: RadiationMap, final: Sequence[Estimate], background_std:
 
 
 def _disagreement(before: Estimate, sources: Sequence[Estimate]) -> list[tuple[Status, str]]:
-    """Between a source of the survey and the nearest of the same nuclide by all counts."""
+    """Between a source of the survey and the nearest of the same nuclide by all counts, with those beside it."""
     alike = [one for one in sources if one.nuclide == before.nuclide]
     if not alike:
         return []
     place = np.asarray(before.position_m, float)[:2]
-    final = min(alike, key=lambda one: float(np.linalg.norm(np.asarray(one.position_m, float)[:2] - place)))
-    apart = np.asarray(final.position_m, float)[:2] - place
+    places = np.array([np.asarray(one.position_m, float)[:2] for one in alike])
+    nearest = int(np.argmin(np.linalg.norm(places - place, axis=1)))
+    # the survey cannot tell sources beside one another apart
+    beside = np.linalg.norm(places - places[nearest], axis=1) < COMPANION_M
+    final, group = alike[nearest], [one for one, near in zip(alike, beside, strict=True) if near]
+    activity = np.array([max(one.activity_mbq, 1e-9) for one in group])
+    apart = activity @ places[beside] / np.sum(activity) - place
     covariance = np.asarray(final.covariance_m2)[:2, :2] + np.asarray(before.covariance_m2)[:2, :2]
     covariance = covariance + MODEL_STD_M**2 * np.eye(2)
     if float(apart @ np.linalg.solve(covariance, apart)) > APART_SIGMA**2:
@@ -221,7 +225,7 @@ def _disagreement(before: Estimate, sources: Sequence[Estimate]) -> list[tuple[S
         text = f"the {final.nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
         return [("inconsistent", text)]
     shares = [float(e.activity_std_mbq) / max(e.activity_mbq, 1e-9) for e in (before, final)]
-    ratio = np.log(max(final.activity_mbq, 1e-9) / max(before.activity_mbq, 1e-9))
+    ratio = np.log(np.sum(activity) / max(before.activity_mbq, 1e-9))
     if abs(ratio) > APART_SIGMA * np.hypot(np.hypot(shares[0], shares[1]), MODEL_STD_LOG):
         text = f"the activity of the {final.nuclide} source by the survey and by all counts differs "
         return [("inconsistent", f"{text}{np.exp(abs(ratio)):.3g} times")]

@@ -101,7 +101,8 @@ def _state(problem, at):
         present=jnp.ones(1, bool),
         nuclide_value=jnp.zeros((1, 1)),
         towards=fit.towards[None],
-        joined=jnp.zeros(1, bool),
+        joined_m=jnp.zeros(1),
+        beside_m=jnp.zeros(1),
     )
     counts = fit.unknowns.activity_bq * fit.rates.counts
     unknowns = replace(fit.unknowns, activity_bq=jnp.zeros(()))

@@ -45,7 +45,7 @@ def test_a_spectrum_that_names_it_says_how_well():
 
 
 def test_a_source_that_may_be_several_is_told_so():
-    joined = (replace(estimate(), joined=True),)
+    joined = (replace(estimate(), joined_m=2.4),)
     assert "m (or several within 3 m, or behind other walls than presumed); " in finding(
         SURE, joined, None, False, False
     )

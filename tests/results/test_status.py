@@ -75,11 +75,11 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"final": (estimate(), estimate(6.0, activity=20.0))}, "ambiguous", "20 MBq 6 m beside a stronger one"),
         ({"final": (estimate(), estimate(0.3, activity=95.0))}, "ambiguous", "95 MBq 0.3 m beside a stronger one"),
         (
-            {"final": (replace(estimate(), joined=True), estimate(8.0, activity=90.0))},
+            {"final": (replace(estimate(), joined_m=2.4), estimate(8.0, activity=90.0))},
             "ambiguous",
             "8 m beside a stronger",
         ),
-        ({"final": (estimate(), estimate(0.3))}, "ambiguous", "0.3 m beside another one"),
+        ({"final": (estimate(activity=85.0), estimate(0.3, activity=85.0))}, "ambiguous", "0.3 m beside another one"),
         (
             {"final": (estimate(), estimate(9.0, activity=0.02, nuclide="I-131"))},
             "ambiguous",
