@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     simulation = swarmsim.build(swarmsim.load(options.mission, settings))
     seeds = range(options.seed, options.seed + options.missions)
     batch = simulation.rollout(seeds)
-    detectable = _detectable(simulation, batch)
+    detectable = detectable_ratios(simulation, batch)
     records = [swarmsim.mission_record(simulation, batch, i) for i in range(options.missions)]
     mission = simulation.scenario.mission
     assert mission.localisation is not None
@@ -74,7 +74,7 @@ def without_sources(mission: str, settings: list[str]) -> list[str]:
     return ["sources=[]", *(f"vary.{path}=null" for path in drawn if path.split(".")[0] == "sources")]
 
 
-def _detectable(simulation: Any, batch: Any) -> list[np.ndarray]:
+def detectable_ratios(simulation: Any, batch: Any) -> list[np.ndarray]:
     """For each mission the likelihood ratio of every true source, in their order, all of them at their true places."""
     plan, world, site = simulation.plan, simulation.world, simulation.site_model.site
 

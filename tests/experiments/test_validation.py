@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import swarmsim
+from experiments.validation import pairs
 from experiments.validation.missions import matches, rows_of, summarised, without_sources
 
 ASKED = (30.0, 60.0)
@@ -41,6 +42,31 @@ def test_nearest_pairs_come_first_and_none_is_used_twice():
     assert {i: k for i, (k, _) in found.items()} == {0: 1, 1: 0}
     assert matches([source(0.0)], [estimate(25.1)]) == {}
     assert {i: k for i, (k, _) in matches([source(0.0), source(4.0)], [estimate(3.0)]).items()} == {1: 0}
+
+
+def test_a_ratio_of_nothing_is_that_of_its_own_source():
+    rows = rows_of(record([source(0.0), source(40.0)], []), np.array([0.0, 90.0]), ASKED)
+    assert [row["true_ratio"] for row in rows] == [0.0, 90.0]
+    assert [row["detectable"] for row in rows] == [False, True]
+
+
+def test_pairs_are_counted_by_what_was_told_of_them():
+    drawn = {"nuclide": "Co-60", "places": np.array([[0.0, 0.0], [4.0, 0.0]]), "mbq": np.array([100.0, 50.0])}
+    plain = [replace_joined(estimate(0.5), 0.0), replace_joined(estimate(4.0), 0.0)]
+    several = [replace_joined(estimate(1.0, std=2.0), 4.0)]
+    rows = [pairs.row_of(drawn, record([], estimates)) for estimates in (plain, several, plain[:1], [])]
+    assert [row["told"] for row in rows] == ["two", "may be several", "one", "none"]
+    assert rows[0]["sigmas"] == [1.0, 0.0]
+    assert rows[2]["sigmas"] == [1.0, 7.0]
+    found = pairs.summarised(rows)["3 to 6 m"]
+    assert found["missions"] == found["located"] == 4
+    assert found["told"] == {"two": 1, "may be several": 1, "one": 1}
+    assert found["both_inside_95"] == 2
+    assert pairs.summarised(rows)["6 to 14 m"]["missions"] == 0
+
+
+def replace_joined(one, joined_m):
+    return SimpleNamespace(**vars(one), joined_m=joined_m)
 
 
 def test_errors_are_in_standard_deviations_of_what_was_stated():

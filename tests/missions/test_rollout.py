@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import swarmsim
+from experiments.validation.missions import detectable_ratios
 from swarmsim.results.names import MEASUREMENTS, MISSIONS, TRAJECTORIES
 from swarmsim.runtime.simulation import Simulation
 
@@ -30,6 +31,14 @@ def batch(simulation):
 @pytest.fixture(scope="module")
 def records(simulation, batch):
     return [swarmsim.mission_record(simulation, batch, index) for index in range(2)]
+
+
+def test_validation_knows_that_the_source_can_be_found(simulation, batch, records):
+    ratios = detectable_ratios(simulation, batch)
+    assert [ratio.shape for ratio in ratios] == [(1,), (1,)]
+    for ratio, record in zip(ratios, records, strict=True):
+        # at the true place the counts ask for it about as much as where it was found
+        assert float(ratio[0]) == pytest.approx(record.estimate.detection, rel=0.02)
 
 
 def test_the_mission_finds_locates_and_names_the_source(records):

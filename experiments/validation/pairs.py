@@ -1,0 +1,115 @@
+"""What missions tell of two sources of one nuclide beside one another.
+
+    python -m experiments.validation.pairs --missions 64 --out out/pairs
+
+Two sources in the open of ``recon``, 1 to 14 m apart, 20 to 400 MBq each. Writes ``pairs.csv`` (a row for each mission)
+and ``summary.json``: by distance, how many are told as two, as one that may be several, or as one; how many of those
+answers that say that they are sure have both sources in the 95 % region of a place that they tell.
+"""
+
+import argparse
+import csv
+import itertools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import swarmsim
+from experiments.validation.missions import INSIDE_95
+from swarmsim.results.record import MissionRecord
+
+NUCLIDES = ("Co-60", "Cs-137", "Na-22", "I-131", "Eu-152")
+APART_M = (1.0, 2.0, 3.0, 6.0, 14.0)
+ACTIVITY_MBQ = (20.0, 400.0)
+PLACE_M = ((-50.0, 50.0), (20.0, 40.0))  # x, and y to either side of the road in the middle of ``works_yard``
+HEIGHT_M = 1.0
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Fly the missions and write what they told."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--missions", type=int, default=64)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
+    options = parser.parse_args(arguments)
+    rng = np.random.default_rng(options.seed)
+    rows = []
+    for number in range(options.missions):
+        drawn = _drawn(rng)
+        settings = ["engine=analytic", "knowledge.nuclides=unknown", f"sources={_sources(drawn)}", *options.set]
+        simulation = swarmsim.build(swarmsim.load("recon", settings))
+        record = swarmsim.mission_record(simulation, simulation.rollout(options.seed + number), 0)
+        rows.append(row_of(drawn, record))
+        print(f"{number + 1} of {options.missions}: {json.dumps(rows[-1])}", flush=True)
+    options.out.mkdir(parents=True, exist_ok=True)
+    with (options.out / "pairs.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    summary = summarised(rows)
+    (options.out / "summary.json").write_text(json.dumps(summary, indent=1))
+    print(json.dumps(summary))
+
+
+def _drawn(rng: np.random.Generator) -> dict[str, Any]:
+    """Nuclide, places [2, 2] and activities [2] of a pair."""
+    apart, turn = np.exp(rng.uniform(*np.log([APART_M[0], APART_M[-1]]))), rng.uniform(0.0, 2.0 * np.pi)
+    first = np.array([rng.uniform(*PLACE_M[0]), rng.choice([-1.0, 1.0]) * rng.uniform(*PLACE_M[1])])
+    return {
+        "nuclide": str(rng.choice(NUCLIDES)),
+        "places": np.array([first, first + apart * np.array([np.cos(turn), np.sin(turn)])]),
+        "mbq": np.exp(rng.uniform(*np.log(ACTIVITY_MBQ), 2)),
+    }
+
+
+def _sources(drawn: dict[str, Any]) -> str:
+    one = "{{nuclide: {}, activity_mbq: {:.2f}, position_m: [{:.3f}, {:.3f}], height_m: {}}}"
+    parts = (one.format(drawn["nuclide"], a, *p, HEIGHT_M) for p, a in zip(drawn["places"], drawn["mbq"], strict=True))
+    return f"[{', '.join(parts)}]"
+
+
+def row_of(drawn: dict[str, Any], record: MissionRecord) -> dict[str, Any]:
+    """What a mission told of a pair; ``sigmas`` are how far both are from the next place, in standard deviations."""
+    sigmas = [min((_sigmas(place, one) for one in record.estimates), default=np.inf) for place in drawn["places"]]
+    if any(one.joined_m > 0.0 for one in record.estimates):
+        told = "may be several"
+    else:
+        told = {0: "none", 1: "one", 2: "two"}.get(len(record.estimates), "more")
+    return {
+        "seed": record.seed,
+        "nuclide": drawn["nuclide"],
+        "apart_m": round(float(np.linalg.norm(drawn["places"][1] - drawn["places"][0])), 2),
+        "mbq": [round(float(a), 1) for a in drawn["mbq"]],
+        "status": record.status,
+        "told": told,
+        "sigmas": [round(float(x), 2) for x in sigmas],
+    }
+
+
+def _sigmas(place: np.ndarray, estimate: Any) -> float:
+    apart = place - np.asarray(estimate.position_m, float)[:2]
+    return float(np.sqrt(apart @ np.linalg.solve(np.asarray(estimate.covariance_m2, float)[:2, :2], apart)))
+
+
+def summarised(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The rows in numbers, by distance."""
+    found = {}
+    for low, high in itertools.pairwise(APART_M):
+        own = [row for row in rows if low <= row["apart_m"] < high]
+        sure = [row for row in own if row["status"] == "located"]
+        inside = [max(row["sigmas"]) < INSIDE_95 for row in sure]
+        found[f"{low:g} to {high:g} m"] = {
+            "missions": len(own),
+            "located": len(sure),
+            "told": {told: sum(row["told"] == told for row in sure) for told in ("two", "may be several", "one")},
+            "both_inside_95": sum(inside),
+        }
+    return found
+
+
+if __name__ == "__main__":
+    main()
