@@ -27,6 +27,7 @@ REACH_M = 8.0
 FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
 COMPANION_SHARE = 0.25  # of the stronger one's activity
+FAINT_SHARE, FAINT_M = 0.01, 25.0  # a source so faint beside one so near adds less than what the model may be off by
 IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
@@ -168,7 +169,8 @@ def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
         share = faint.activity_mbq / max(strong.activity_mbq, 1e-12)
         alike = faint.nuclide == strong.nuclide and apart < (COMPANION_M if share < COMPANION_SHARE else ONE_M)
         # what the model does not explain about a source is taken up by others near it, of any nuclide
-        if alike or (strong.joined_m > 0.0 and apart < COMPANION_M):
+        taken_up = (strong.joined_m > 0.0 and apart < COMPANION_M) or (share < FAINT_SHARE and apart < FAINT_M)
+        if alike or taken_up:
             other = "a stronger one" if share < 1.0 else "another one"
             text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
             found.append(("ambiguous", f"{text} may be an error of the model"))

@@ -86,6 +86,11 @@ def test_a_good_answer_has_no_reasons() -> None:
             "of 0.02 MBq is 5,000 times weaker",
         ),
         (
+            {"final": (estimate(), estimate(20.0, activity=0.9, nuclide="I-131"))},
+            "ambiguous",
+            "0.9 MBq 20 m beside a stronger one may be an error of the model",
+        ),
+        (
             {"final": (estimate(), estimate(9.0, activity=2e6, nuclide="I-131"))},
             "ambiguous",
             r"stronger than presumed \(knowledge.activity_mbq\)",
