@@ -26,6 +26,7 @@ APART_M = (1.0, 2.0, 3.0, 6.0, 14.0)
 ACTIVITY_MBQ = (20.0, 400.0)
 PLACE_M = ((-50.0, 50.0), (20.0, 40.0))  # x, and y to either side of the road in the middle of ``works_yard``
 HEIGHT_M = 1.0
+TRIES = 20  # pairs that are drawn for one in the open
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -39,9 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rng = np.random.default_rng(options.seed)
     rows = []
     for number in range(options.missions):
-        drawn = _drawn(rng)
-        settings = ["engine=analytic", "knowledge.nuclides=unknown", f"sources={_sources(drawn)}", *options.set]
-        simulation = swarmsim.build(swarmsim.load("recon", settings))
+        drawn, simulation = _built(rng, options.set)
         record = swarmsim.mission_record(simulation, simulation.rollout(options.seed + number), 0)
         rows.append(row_of(drawn, record))
         print(f"{number + 1} of {options.missions}: {json.dumps(rows[-1])}", flush=True)
@@ -53,6 +52,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     summary = summarised(rows)
     (options.out / "summary.json").write_text(json.dumps(summary, indent=1))
     print(json.dumps(summary))
+
+
+def _built(rng: np.random.Generator, settings: Sequence[str]) -> tuple[dict[str, Any], swarmsim.Simulation]:
+    """A pair that is drawn, and the simulation with it; another one where a source would lie within an obstacle."""
+    for _ in range(TRIES):
+        drawn = _drawn(rng)
+        own = ["engine=analytic", "knowledge.nuclides=unknown", f"sources={_sources(drawn)}", *settings]
+        scenario = swarmsim.load("recon", own)
+        try:
+            return drawn, swarmsim.build(scenario)
+        except swarmsim.InputError:
+            continue
+    raise RuntimeError(f"of {TRIES} pairs none lies in the open")
 
 
 def _drawn(rng: np.random.Generator) -> dict[str, Any]:
