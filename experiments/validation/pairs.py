@@ -2,7 +2,7 @@
 
     python -m experiments.validation.pairs --missions 64 --out out/pairs
 
-Two sources in the open of ``recon``, 1 to 14 m apart, 20 to 400 MBq each. Writes ``pairs.csv`` (a row for each mission)
+Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no solid obstacle but in buildings as well. Writes ``pairs.csv`` (a row for each mission)
 and ``summary.json``: by distance, how many are told as two, as one that may be several, or as one; how many of those
 answers that say that they are sure have both sources in the 95 % region of a place that they tell.
 """
@@ -26,7 +26,7 @@ APART_M = (1.0, 2.0, 3.0, 6.0, 14.0)
 ACTIVITY_MBQ = (20.0, 400.0)
 PLACE_M = ((-50.0, 50.0), (20.0, 40.0))  # x, and y to either side of the road in the middle of ``works_yard``
 HEIGHT_M = 1.0
-TRIES = 20  # pairs that are drawn for one in the open
+TRIES = 20  # pairs that are drawn for one in no obstacle
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _built(rng: np.random.Generator, settings: Sequence[str]) -> tuple[dict[str, Any], swarmsim.Simulation]:
-    """A pair that is drawn, and the simulation with it; another one where a source would lie within an obstacle."""
+    """A pair that is drawn, and the simulation with it; another one where a source would lie within a solid obstacle."""
     for _ in range(TRIES):
         drawn = _drawn(rng)
         own = ["engine=analytic", "knowledge.nuclides=unknown", f"sources={_sources(drawn)}", *settings]
@@ -64,7 +64,7 @@ def _built(rng: np.random.Generator, settings: Sequence[str]) -> tuple[dict[str,
             return drawn, swarmsim.build(scenario)
         except swarmsim.InputError:
             continue
-    raise RuntimeError(f"of {TRIES} pairs none lies in the open")
+    raise RuntimeError(f"of {TRIES} pairs none lies in no obstacle")
 
 
 def _drawn(rng: np.random.Generator) -> dict[str, Any]:
