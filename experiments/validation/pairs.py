@@ -2,9 +2,10 @@
 
     python -m experiments.validation.pairs --missions 64 --out out/pairs
 
-Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no solid obstacle but in buildings as well. Writes ``pairs.csv`` (a row for each mission)
-and ``summary.json``: by distance, how many are told as two, as one that may be several, or as one; how many of those
-answers that say that they are sure have both sources in the 95 % region of a place that they tell.
+Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no solid obstacle but in buildings as well.
+Writes ``pairs.csv`` (a row for each mission) and ``summary.json``: by distance, how many are told as two, as one that
+may be several, or as one; how many of those answers that say that they are sure have both sources in the 95 % region of
+a place that they tell.
 """
 
 import argparse
@@ -55,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _built(rng: np.random.Generator, settings: Sequence[str]) -> tuple[dict[str, Any], swarmsim.Simulation]:
-    """A pair that is drawn, and the simulation with it; another one where a source would lie within a solid obstacle."""
+    """A pair that is drawn, and the simulation with it; another one where a source would lie in a solid obstacle."""
     for _ in range(TRIES):
         drawn = _drawn(rng)
         own = ["engine=analytic", "knowledge.nuclides=unknown", f"sources={_sources(drawn)}", *settings]
@@ -64,7 +65,7 @@ def _built(rng: np.random.Generator, settings: Sequence[str]) -> tuple[dict[str,
             return drawn, swarmsim.build(scenario)
         except swarmsim.InputError:
             continue
-    raise RuntimeError(f"of {TRIES} pairs none lies in no obstacle")
+    raise RuntimeError(f"of {TRIES} pairs each lies in an obstacle")
 
 
 def _drawn(rng: np.random.Generator) -> dict[str, Any]:
