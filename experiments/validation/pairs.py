@@ -2,7 +2,7 @@
 
     python -m experiments.validation.pairs --missions 64 --out out/pairs
 
-Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no solid obstacle but in buildings as well.
+Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no solid obstacle but in buildings too.
 Writes ``pairs.csv`` (a row for each mission) and ``summary.json``: by distance, how many are told as two, as one that
 may be several, or as one; how many of those answers that say that they are sure have both sources in the 95 % region of
 a place that they tell.
