@@ -38,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
     options = parser.parse_args(arguments)
+    if options.missions < 1:
+        parser.error(f"argument --missions: {options.missions} is too few, give 1 or more")
     rng = np.random.default_rng(options.seed)
     rows = []
     for number in range(options.missions):

@@ -104,12 +104,16 @@ def divided(problem: Problem, state: State) -> tuple[jax.Array, jax.Array, jax.A
 
 def _nearest(s: Sources) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The two nearest of one nuclide: the stronger and the weaker one [], and whether [] they are companions."""
+    apart = _apart_m(s)
+    weaker, stronger = jnp.unravel_index(jnp.argmin(apart), apart.shape)
+    return stronger, weaker, jnp.min(apart) < COMPANION_M
+
+
+def _apart_m(s: Sources) -> jax.Array:
+    """Distances [K, K] of each source from each stronger one of its nuclide; infinite from all others."""
     apart = jnp.linalg.norm(s.place[:, None, :2] - s.place[:, :2], axis=-1)
     alike = (s.nuclide[:, None] == s.nuclide) & s.present[:, None] & s.present
-    order = s.activity_bq[:, None] > s.activity_bq
-    apart = jnp.where(alike & order, apart, jnp.inf)
-    stronger, weaker = jnp.unravel_index(jnp.argmin(apart), apart.shape)
-    return stronger, weaker, jnp.min(apart) < COMPANION_M
+    return jnp.where(alike & (s.activity_bq[:, None] < s.activity_bq), apart, jnp.inf)
 
 
 def _around(count: int) -> jax.Array:
@@ -149,11 +153,8 @@ def joined(problem: Problem, state: State) -> tuple[State, jax.Array]:
 
     It is fitted anew at the places that are left.
     """
-    s = state.sources
-    offset = s.place[:, None, :2] - s.place[:, :2]  # [weaker, stronger, 2]
-    apart = jnp.linalg.norm(offset, axis=-1)
-    alike = (s.nuclide[:, None] == s.nuclide) & s.present[:, None] & s.present
-    near = alike & (s.activity_bq[:, None] < s.activity_bq) & (apart < COMPANION_M)
+    s, apart = state.sources, _apart_m(state.sources)  # [weaker, stronger]
+    near = apart < COMPANION_M
     ratio = for_those(jnp.any(near), lambda: ratios(problem, state), lambda: jnp.zeros(s.present.shape))
     beside = near & ((apart < ONE_M) | (ratio[:, None] < COMPANION_RATIO * ratio))
     companion = jnp.any(beside, axis=1)
@@ -164,7 +165,7 @@ def joined(problem: Problem, state: State) -> tuple[State, jax.Array]:
             s,
             present=left,
             joined_m=jnp.where(left, jnp.max(jnp.where(beside, apart, 0.0), axis=0), 0.0),
-            beside_m=jnp.where(left, _about_mean(s, offset, beside), 0.0),
+            beside_m=jnp.where(left, _about_mean(s, beside), 0.0),
         )
         added = replace(state.added, counts=jnp.where(companion[:, None, None], 0.0, state.added.counts))
         return settled(problem, replace(state, sources=sources, added=added))
@@ -173,9 +174,10 @@ def joined(problem: Problem, state: State) -> tuple[State, jax.Array]:
     return for_those(some, join, lambda: state), some
 
 
-def _about_mean(s: Sources, offset_m: jax.Array, beside: jax.Array) -> jax.Array:
+def _about_mean(s: Sources, beside: jax.Array) -> jax.Array:
     """Root [K] of the second moment of each source and those ``beside`` it [K, K], by activity, about their mean."""
     activity = jnp.where(beside, s.activity_bq[:, None], 0.0)
     share = activity / jnp.maximum(s.activity_bq + jnp.sum(activity, axis=0), 1e-9)
-    mean, second = jnp.einsum("ws,wsi->si", share, offset_m), jnp.einsum("ws,wsi->s", share, jnp.square(offset_m))
+    offset = s.place[:, None, :2] - s.place[:, :2]
+    mean, second = jnp.einsum("ws,wsi->si", share, offset), jnp.einsum("ws,wsi->s", share, jnp.square(offset))
     return jnp.sqrt(jnp.maximum(second - jnp.sum(jnp.square(mean), axis=-1), 0.0))

@@ -52,8 +52,8 @@ def test_a_ratio_of_nothing_is_that_of_its_own_source():
 
 def test_pairs_are_counted_by_what_was_told_of_them():
     drawn = {"nuclide": "Co-60", "places": np.array([[0.0, 0.0], [4.0, 0.0]]), "mbq": np.array([100.0, 50.0])}
-    plain = [replace_joined(estimate(0.5), 0.0), replace_joined(estimate(4.0), 0.0)]
-    several = [replace_joined(estimate(1.0, std=2.0), 4.0)]
+    plain = [with_joined(estimate(0.5), 0.0), with_joined(estimate(4.0), 0.0)]
+    several = [with_joined(estimate(1.0, std=2.0), 4.0)]
     rows = [pairs.row_of(drawn, record([], estimates)) for estimates in (plain, several, plain[:1], [])]
     assert [row["told"] for row in rows] == ["two", "may be several", "one", "none"]
     assert rows[0]["sigmas"] == [1.0, 0.0]
@@ -65,7 +65,15 @@ def test_pairs_are_counted_by_what_was_told_of_them():
     assert pairs.summarised(rows)["6 to 14 m"]["missions"] == 0
 
 
-def replace_joined(one, joined_m):
+def test_no_pairs_at_all_are_refused(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        pairs.main(["--missions", "0", "--out", str(tmp_path / "out")])
+    assert stopped.value.code == 2
+    assert "--missions: 0 is too few" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def with_joined(one, joined_m):
     return SimpleNamespace(**vars(one), joined_m=joined_m)
 
 

@@ -50,6 +50,17 @@ def verdict(
     )  # fmt: skip
 
 
+def test_the_survey_is_compared_with_all_sources_beside_one_another() -> None:
+    """What it took for one source of 340 MBq are two of 170; one of 170 alone contradicts it."""
+    survey_of_both = (estimate(2.0, std=1.0, activity=340.0),)
+    assert verdict(aerial=survey_of_both, final=(estimate(), estimate(4.0))).status == "located"
+    alone = verdict(aerial=survey_of_both, final=(estimate(),))
+    assert alone.status == "inconsistent"
+    assert "by the survey and by all counts differs 2 times" in " ".join(alone.reasons)
+    # one farther off is another source
+    assert verdict(aerial=survey_of_both, final=(estimate(), estimate(30.0))).status == "inconsistent"
+
+
 def test_a_good_answer_has_no_reasons() -> None:
     assert verdict().status == "located"
     assert verdict().reasons == ()
