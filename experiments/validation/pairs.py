@@ -102,7 +102,18 @@ def row_of(drawn: dict[str, Any], record: MissionRecord) -> dict[str, Any]:
         "status": record.status,
         "told": told,
         "sigmas": [round(float(x), 2) for x in sigmas],
+        "beside_mbq": _beside_mbq(drawn, record),
     }
+
+
+def _beside_mbq(drawn: dict[str, Any], record: MissionRecord) -> float | None:
+    """What the answer says that a source beside the stronger one of the pair must have to be noticed; None: nothing."""
+    stronger = drawn["places"][int(np.argmax(drawn["mbq"]))]
+    apart = [float(np.linalg.norm(np.asarray(one.position_m)[:2] - stronger)) for one in record.estimates]
+    if not apart:
+        return None
+    limit = float(record.estimates[int(np.argmin(apart))].beside_mbq)
+    return round(limit, 1) if np.isfinite(limit) else None
 
 
 def _sigmas(place: np.ndarray, estimate: Any) -> float:

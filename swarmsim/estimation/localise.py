@@ -32,6 +32,7 @@ BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known
 POINTS_MAX = 20_000  # of the grid of the first look
 CONVERGED_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
+NOTICED = 1.645  # standard deviations above what is asked of a further source: it has that with 95 % (ISO 11929)
 UNSURE = 0.25  # standard deviation of a place whose posterior could not be sampled, over the reach of the search
 
 
@@ -84,6 +85,7 @@ class SourceFits:
     effective_samples: jax.Array  # [K] number of independent places that the posterior's weighted ones are worth
     converged: jax.Array  # [K] bool: those are enough, and two halves of them agree
     joined_m: jax.Array  # [K] so far off another one of its nuclide would explain the counts better; 0: none
+    beside_bq: jax.Array  # [K] from which on another one of its nuclide beside it would have been noticed; inf: never
 
 
 @pytree
@@ -295,7 +297,7 @@ def sampled(
 
 def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Estimated:
     site, s, m = presumed.site, state.sources, problem.measurements
-    posterior, overall = posteriors(problem, state, params.sample_rounds, params.samples)
+    posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
     converged, mean, covariance = sampled(presumed, params, s, posterior)
     log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std)
@@ -318,6 +320,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         effective_samples=jnp.nan_to_num(posterior.effective),
         converged=converged,
         joined_m=s.joined_m,
+        beside_bq=jnp.where(told > 0.0, (jnp.sqrt(params.search.further) + NOTICED) / jnp.sqrt(told), jnp.inf),
     )
     order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))
 

@@ -75,6 +75,8 @@ class Screen:
     own: jax.Array  # [2, R, n] change with the window's own unknowns
     inverse: jax.Array  # [2, 2, n] of the information about those
     registered: jax.Array  # [n] of the counts that are added
+    there: jax.Array  # [R, n] what the source of the fit adds, as it is registered
+    there_own: jax.Array  # [2, n] of it the part that the window's own unknowns take up
 
 
 def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array, u: Unknowns) -> Screen:
@@ -83,18 +85,33 @@ def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array,
     assert m.rois is not None
     model = linearised(problem, source, others, where, u)
     zero = jnp.zeros_like(u.gain)
+    own, inverse = of_window(model.columns, u.others.shape[0]), normal_equations(problem, model, u).own
+    weight = jnp.where(m.valid, problem.trust.T / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
+    there = u.activity_bq * source.counts.T * model.registered
     rest = linearised(problem, source, others, where, replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(())))
     return Screen(
         left=jnp.where(m.valid, m.rois.T - rest.mean, 0.0),
-        weight=jnp.where(m.valid, problem.trust.T / jnp.maximum(model.mean, MEAN_FLOOR), 0.0),
-        own=of_window(model.columns, u.others.shape[0]),
-        inverse=normal_equations(problem, model, u).own,
+        weight=weight,
+        own=own,
+        inverse=inverse,
         registered=model.registered,
+        there=there,
+        there_own=jnp.einsum("abn,bn->an", inverse, jnp.sum(own * weight * there, axis=1)),
     )
 
 
 def screened(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> jax.Array:
     """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted."""
+    return looked_at(problem, screen, nuclide, place)[0]
+
+
+def looked_at(
+    problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array
+) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    """What `screened` finds with a source at ``place`` [3] in the place of that of the fit; and with one beside it.
+
+    The latter is the information [] (1/Bq^2) about its activity, that of the source of the fit unknown too.
+    """
     lengths = jnp.zeros_like(problem.material_std)
     net = rates(problem, ways_from(problem, place), nuclide, lengths).counts.T * screen.registered
     weighted = screen.weight * net
@@ -108,7 +125,13 @@ def screened(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Ar
     prior = 0.5 * height_precision(problem.height_std_m) * jnp.square(deviation)
     value = 0.5 * jnp.square(jnp.maximum(score, 0.0)) / jnp.maximum(information, 1e-30) - prior
     # what walls hide all of, and what is as nothing beside rounding, explains no count
-    return jnp.where(jnp.isfinite(value) & (information > ROUNDING * whole), value, -prior)
+    value = jnp.where(jnp.isfinite(value) & (information > ROUNDING * whole), value, -prior)
+    both = jnp.sum(weighted * screen.there) - jnp.sum(screen.there_own * inside)
+    one = jnp.sum(screen.weight * jnp.square(screen.there)) - jnp.sum(
+        screen.there_own * jnp.sum(screen.own * screen.weight * screen.there, axis=1)
+    )
+    beside = information - jnp.square(both) / jnp.maximum(one, 1e-30)
+    return value, jnp.where(beside > ROUNDING * whole, beside, 0.0)
 
 
 def spread(centre: jax.Array, reach_m: jax.Array, up_m: jax.Array, count: int, turn: jax.Array) -> jax.Array:

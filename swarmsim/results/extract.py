@@ -231,6 +231,7 @@ def _estimates(estimated: Estimated, nuclides: tuple[str, ...]) -> tuple[Estimat
             effective_samples=float(fits.effective_samples[k]),
             converged=bool(fits.converged[k]),
             joined_m=float(fits.joined_m[k]),
+            beside_mbq=float(fits.beside_bq[k]) * 1e-6,
         )
         for k in np.flatnonzero(np.asarray(fits.present))
     )

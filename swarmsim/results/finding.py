@@ -2,6 +2,7 @@
 
 import math
 
+from swarmsim.estimation.pairs import COMPANION_M
 from swarmsim.results.record import Estimate, Spectrum
 from swarmsim.results.status import Verdict, in_mbq
 
@@ -37,9 +38,16 @@ def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool,
         return NOTHING_FOUND
     first = _surest(final[0], spectrum, no_way, by)
     if len(final) == 1:
-        return f"a source of {first}"
+        return f"a source of {first}; {_beside(final)}"
     others = "; ".join(f"of {_placed(one)}" for one in final[1:])
-    return f"{len(final)} sources: of {first}; {others}"
+    return f"{len(final)} sources: of {first}; {others}; {_beside(final)}"
+
+
+def _beside(final: tuple[Estimate, ...]) -> str:
+    """What another source beside each of those found would have to be to be noticed."""
+    limits = [f"from {one.beside_mbq:.2g} MBq on" if math.isfinite(one.beside_mbq) else "never" for one in final]
+    whom = "it" if len(final) == 1 else "each"
+    return f"another one within {COMPANION_M:g} m of {whom} would be noticed {', '.join(limits)}"
 
 
 def _placed(estimate: Estimate) -> str:

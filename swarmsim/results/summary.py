@@ -33,6 +33,8 @@ _ESTIMATE_KEYS = (
     "activity_std_mbq",
     "activity_error_percent",
     "background_scale",
+    "several_within_m",
+    "beside_noticed_mbq",
     "dose_rate_1m_usv_h",
     "dose_rate_1m_std_usv_h",
     "kerma_rate_1m_ugy_h",
@@ -179,7 +181,9 @@ def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[s
     """An estimate with its standard deviations and its errors against the nearest true source of the mission.
 
     ``error_m`` is the distance in space, ``error_horizontal_m`` the distance on the map; ``activity_error_percent`` is
-    the size of the error over the true activity. Dose rates 1 m from the source are those of its activity with nothing
+    the size of the error over the true activity. ``several_within_m`` is there where it may be several sources, so near
+    to one another; ``beside_noticed_mbq`` is the activity from which on another one of its nuclide, 3 to 12 m off,
+    would have been noticed (`Estimate.beside_mbq`). Dose rates 1 m from the source are those of its activity with nothing
     around it; their standard deviations are the activity's, for the nuclide that was estimated.
     """
     if estimate is None:
@@ -199,6 +203,8 @@ def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[s
         if nearest is None or nearest.activity_mbq <= 0.0
         else 100.0 * abs(activity - float(nearest.activity_mbq)) / float(nearest.activity_mbq),
         float(estimate.background_scale),
+        float(estimate.joined_m) or None,
+        float(estimate.beside_mbq) if np.isfinite(estimate.beside_mbq) else None,
         None if at_1_m is None else at_1_m.ambient_usv_h * activity,
         None if at_1_m is None else at_1_m.ambient_usv_h * float(estimate.activity_std_mbq),
         None if at_1_m is None else at_1_m.kerma_ugy_h * activity,
