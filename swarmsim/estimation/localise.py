@@ -14,9 +14,11 @@ import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
 from swarmsim.estimation.forward import Problem, Span, nodes_of, padded, trust_of
+from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.likelihood import natural_background, position_covariance
 from swarmsim.estimation.measurements import Measurements, cleared
-from swarmsim.estimation.posterior import Posterior, posteriors
+from swarmsim.estimation.pairs import strain
+from swarmsim.estimation.posterior import of_others, posteriors
 from swarmsim.estimation.sources import SearchParams, find_sources
 from swarmsim.estimation.state import Sources, State, no_sources, ratios
 from swarmsim.pytree import on_host, pytree, static
@@ -96,6 +98,7 @@ class Estimated:
     background_scale: jax.Array  # [] of the first detector model's nominal one
     misfit: jax.Array  # [] standard deviations by which Pearson's chi-squared exceeds its degrees of freedom
     chi_squared: jax.Array  # [] over its degrees of freedom, about 1 for a model that describes the counts
+    strain: jax.Array  # [] what windows' rates depart from the model by, beyond what is usual (`pairs.strain`)
     windows: jax.Array  # [] number of valid ones
     state: State  # to go on from when there are more counts
 
@@ -300,7 +303,10 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
     posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
     converged, mean, covariance = sampled(presumed, params, s, posterior)
-    log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std)
+    covariance = covariance + of_others(problem, state)
+    # those that were taken away may be a part of it, or it a part of them
+    shared_ = jnp.minimum(s.beside_bq / jnp.maximum(s.activity_bq, 1.0), 1.0)
+    log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std) + jnp.square(shared_)
     height = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(mean[:, :2])
     activity = jnp.exp(mean[:, 3])
 
@@ -322,6 +328,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         joined_m=s.joined_m,
         beside_bq=jnp.where(told > 0.0, (jnp.sqrt(params.search.further) + NOTICED) / jnp.sqrt(told), jnp.inf),
     )
+    strained, usual = strain(problem, state)
     order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))
 
     def ordered(x: Any) -> Any:
@@ -332,6 +339,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         background_scale=jnp.exp(state.unknowns.level[0]),
         misfit=(overall.chi_squared - overall.freedom) / overall.spread,
         chi_squared=overall.chi_squared / overall.freedom,
+        strain=strained - usual,
         windows=jnp.sum(m.valid),
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

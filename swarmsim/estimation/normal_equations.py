@@ -157,9 +157,20 @@ class NormalEquations:
     fitted: jax.Array  # [] how many of them the data determine
 
 
-@jax.jit  # traced once for all places of a program that call it
-def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> NormalEquations:
-    """The normal equations at ``u``, where ``model`` is linearised."""
+@pytree
+class _Eliminated:
+    """Normal equations of the columns of `Linearised` in each window, its own unknowns eliminated."""
+
+    products: jax.Array  # [B, B, n]
+    pushes: jax.Array  # [B, n]
+    own: jax.Array  # [2, 2, n] as in `NormalEquations`, and so on
+    crossing: jax.Array  # [2, B, n]
+    own_push: jax.Array  # [2, n]
+    precision: jax.Array  # [2, n]
+    determinant: jax.Array  # [n] of the information about a window's own unknowns
+
+
+def _eliminated(problem: Problem, model: Linearised, u: Unknowns) -> _Eliminated:
     m, k = problem.measurements, u.others.shape[0]
     assert m.rois is not None
     columns = model.columns
@@ -173,30 +184,62 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
     own = jnp.stack([jnp.stack([h[1, 1], -h[0, 1]]), jnp.stack([-h[1, 0], h[0, 0]])]) / determinant
     own_push = of_window(pushes, k) - precision * window_unknowns(u)
     turned = own[:, 0, None] * crossing[0] + own[:, 1, None] * crossing[1]  # [2, B, n]
-    products = products - (turned[0][:, None] * crossing[0] + turned[1][:, None] * crossing[1])
-    pushes = pushes - (turned[0] * own_push[0] + turned[1] * own_push[1])
+    return _Eliminated(
+        products=products - (turned[0][:, None] * crossing[0] + turned[1][:, None] * crossing[1]),
+        pushes=pushes - (turned[0] * own_push[0] + turned[1] * own_push[1]),
+        own=own,
+        crossing=crossing,
+        own_push=own_push,
+        precision=precision,
+        determinant=determinant,
+    )
 
+
+@jax.jit  # traced once for all places of a program that call it
+def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> NormalEquations:
+    """The normal equations at ``u``, where ``model`` is linearised."""
+    m, k = problem.measurements, u.others.shape[0]
+    e = _eliminated(problem, model, u)
     column, factor = _unknowns(problem, model, k)
-    whole = jnp.sum(products[column][:, column] * factor[:, None] * factor, axis=-1)
-    push = jnp.sum(pushes[column] * factor, axis=-1)
+    whole = jnp.sum(e.products[column][:, column] * factor[:, None] * factor, axis=-1)
+    push = jnp.sum(e.pushes[column] * factor, axis=-1)
     common_precision = prior_precision(problem, k)
     p = common_precision.shape[0]
     information = whole[:p, :p] + jnp.diag(common_precision)
     across = whole[:p, p:]
     common_push = push[:p] - common_precision * _common(u)
     inverse = scaled_inverse(information)
-    told = own[0, 0] * precision[0] + own[1, 1] * precision[1]
+    told = e.own[0, 0] * e.precision[0] + e.own[1, 1] * e.precision[1]
     return NormalEquations(
         information=information,
         push=common_push,
-        own=own,
-        crossing=crossing,
-        own_push=own_push,
+        own=e.own,
+        crossing=e.crossing,
+        own_push=e.own_push,
         towards=whole[p:, p:] - across.T @ inverse @ across,
         pull=push[p:] - across.T @ inverse @ common_push,
-        log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(determinant * jnp.prod(model.variance, axis=0)), 0.0)),
+        log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(e.determinant * jnp.prod(model.variance, axis=0)), 0.0)),
         fitted=jnp.sum(jnp.where(m.valid, 2.0 - told, 0.0)),
     )
+
+
+@jax.jit
+def joint_information(problem: Problem, model: Linearised, u: Unknowns, places_m: jax.Array) -> jax.Array:
+    """Information [4 K, 4 K] about (x, y, height, log activity) of each of the sources at ``places_m`` [K, 3] (world).
+
+    The levels are eliminated; as if nothing were in the way. ``model`` has no source but the K others.
+    """
+    count, levels = u.others.shape[0], len(problem.detectors)
+    products = _eliminated(problem, model, u).products
+    offset = places_m[:, None] - problem.measurements.position_m
+    squared = jnp.maximum(jnp.sum(offset * offset, axis=-1, keepdims=True), 0.01)
+    nearer = jnp.concatenate([-2.0 * offset / squared, jnp.ones_like(squared)], axis=-1)  # [K, n, 4]
+    factor = jnp.concatenate([jnp.swapaxes(nearer, 1, 2).reshape(4 * count, -1), detector_of(problem).T])
+    column = np.array([*np.repeat(1 + np.arange(count), 4), *[1 + count] * levels])
+    whole = jnp.sum(products[column][:, column] * factor[:, None] * factor, axis=-1)
+    own, across = whole[: 4 * count, : 4 * count], whole[: 4 * count, 4 * count :]
+    of_levels = whole[4 * count :, 4 * count :] + LOOSE * jnp.eye(levels)
+    return own - across @ scaled_inverse(of_levels) @ across.T
 
 
 def _products(one: jax.Array, other: jax.Array) -> jax.Array:

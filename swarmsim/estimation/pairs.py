@@ -6,7 +6,7 @@ anything left to explain then. But errors of the model that are all of that size
 something is wrong (`strain`); and two sources fitted together explain the counts without them (`divided`).
 
 On the other hand what the model does not know of walls about a strong source looks like a weak one beside it. That is
-taken away, and the place of the other is known no better than to the distance between them (`joined`).
+taken away, and what it said of place and activity counts as an error of the other (`joined`).
 """
 
 from dataclasses import replace
@@ -15,9 +15,9 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import each, for_those
+from swarmsim.device import each, for_those, repeat_while
 from swarmsim.estimation.forward import Problem, rates, silent, variance_of, ways_from
-from swarmsim.estimation.normal_equations import Others, linearised
+from swarmsim.estimation.normal_equations import Others, linearised, normal_equations
 from swarmsim.estimation.search import TOGETHER, Tried, attempt, bounds
 from swarmsim.estimation.state import Sources, State, ratios, settled, without
 from swarmsim.pytree import pytree
@@ -29,7 +29,7 @@ AROUND_M = 1.0  # within which the places of both are changed together, in the f
 CLOSER = 0.6  # the same in a further round, over that in the one before
 ROUNDS = 7
 # fractional parts of multiples of these fill four dimensions evenly: powers of the root of x^5 = x + 1 (as in
-# `swarmsim.estimation.posterior`)
+# `swarmsim.estimation.importance_sampling`)
 _EVEN = (0.8566749, 0.7338919, 0.6287067, 0.5385972)
 ONE_M = 3.0  # within it two sources of one nuclide are told as one
 COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
@@ -48,16 +48,21 @@ class Divided:
     second: Tried
 
 
-def strain(problem: Problem, state: State) -> jax.Array:
+def strain(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
     """Minus twice the log prior [] of what windows' rates depart from the model by, over that of no departure.
 
-    With the right number of sources it is about 20 in a mission of 400 windows.
+    With the right number of sources it is about 20 in a mission of 400 windows of which the model is right. The second
+    is its mean [] where each window that tells departs by an error from that prior.
     """
-    u = state.unknowns
+    u, tail, valid = state.unknowns, problem.tail, problem.measurements.valid
     model = linearised(problem, silent(problem), state.added, jnp.zeros(3), u)
     relative = jnp.square(u.gain) / model.variance[1]
-    each_ = (problem.tail + 1.0) * jnp.log1p(relative / problem.tail)
-    return jnp.sum(jnp.where(problem.measurements.valid, each_, 0.0))
+    at = normal_equations(problem, model, u)
+    told = jnp.clip(1.0 - at.own[1, 1] / model.variance[1], 0.0, 1.0)
+    digamma = jax.scipy.special.digamma
+    usual = (tail + 1.0) * (digamma(0.5 * (tail + 1.0)) - digamma(0.5 * tail))
+    each_ = (tail + 1.0) * jnp.log1p(relative / tail)
+    return jnp.sum(jnp.where(valid, each_, 0.0)), usual * jnp.sum(jnp.where(valid, told, 0.0))
 
 
 def divisible(s: Sources) -> jax.Array:
@@ -66,7 +71,7 @@ def divisible(s: Sources) -> jax.Array:
 
 
 def divided(problem: Problem, state: State) -> tuple[jax.Array, jax.Array, jax.Array, Divided]:
-    """Two sources in the place of one; of two beside one another, in the place of those.
+    """Two sources in the place of one; the two nearest to one another, if they are companions, are placed anew.
 
     Returns:
         the number of the first, that of the second [], twice the logarithm of the likelihood ratio [] over the state,
@@ -74,23 +79,29 @@ def divided(problem: Problem, state: State) -> tuple[jax.Array, jax.Array, jax.A
     """
     s = state.sources
     stronger, weaker, beside = _nearest(s)
-    numbers = jnp.arange(s.present.shape[0])
-    base = jax.tree.map(partial(jnp.where, beside), without(state, weaker), state)
-    slot = jnp.where(beside, weaker, jnp.argmin(s.present))
-    asked = jnp.where(beside, numbers == stronger, s.present)
+    numbers, full = jnp.arange(s.present.shape[0]), jnp.all(s.present)
+    pair = without(state, weaker)
     starts = _offsets()
     here = jnp.stack([jnp.zeros(2), s.place[weaker, :2] - s.place[stronger, :2]])
-    starts = jnp.where(beside, here + _around(starts.shape[0]) * AROUND_M, starts)
+    anew = here + _around(starts.shape[0]) * AROUND_M
+
+    def base(k: jax.Array) -> tuple[jax.Array, State]:
+        """Whether [] the source ``k`` is one of a pair that is placed anew, and the state with that one alone."""
+        again = beside & (k == stronger)
+        return again, jax.tree.map(partial(jnp.where, again), pair, state)
 
     def likelihoods(k: jax.Array, offsets: jax.Array) -> jax.Array:
-        return each(lambda x: _as_two(problem, base, k, x).second.fit.likelihood, offsets, TOGETHER)
+        rest = base(k)[1]
+        return each(lambda x: _as_two(problem, rest, k, x).second.fit.likelihood, offsets, TOGETHER)
 
     def of_source(k: jax.Array) -> jax.Array:
-        nothing = jnp.full(starts.shape[0], -jnp.inf)
-        return for_those(asked[k], lambda: likelihoods(k, starts), lambda: nothing)
+        again, nothing = base(k)[0], jnp.full(starts.shape[0], -jnp.inf)
+        asked = s.present[k] & (again | ~(full | (beside & (k == weaker))))
+        return for_those(asked, lambda: likelihoods(k, jnp.where(again, anew, starts)), lambda: nothing)
 
     value = jax.lax.map(of_source, numbers)
     k, number = jnp.unravel_index(jnp.argmax(value), value.shape)
+    again, rest = base(k)
 
     def closer(number: jax.Array, best: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         offsets = best[0] + _around(TOGETHER) * AROUND_M * CLOSER**number
@@ -98,22 +109,26 @@ def divided(problem: Problem, state: State) -> tuple[jax.Array, jax.Array, jax.A
         top = jnp.argmax(found)
         return jax.tree.map(partial(jnp.where, found[top] > best[1]), (offsets[top], found[top]), best)
 
-    offset, likelihood = jax.lax.fori_loop(0, ROUNDS, closer, (starts[number], jnp.max(value)))
-    return k, slot, 2.0 * (likelihood - state.likelihood), _as_two(problem, base, k, offset)
+    first = jnp.where(again, anew, starts)[number]
+    offset, likelihood = jax.lax.fori_loop(0, ROUNDS, closer, (first, jnp.max(value)))
+    slot = jnp.where(again, weaker, jnp.argmin(s.present))
+    return k, slot, 2.0 * (likelihood - state.likelihood), _as_two(problem, rest, k, offset)
 
 
 def _nearest(s: Sources) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The two nearest of one nuclide: the stronger and the weaker one [], and whether [] they are companions."""
-    apart = _apart_m(s)
+    apart = _apart_m(s, s.activity_bq)
     weaker, stronger = jnp.unravel_index(jnp.argmin(apart), apart.shape)
     return stronger, weaker, jnp.min(apart) < COMPANION_M
 
 
-def _apart_m(s: Sources) -> jax.Array:
-    """Distances [K, K] of each source from each stronger one of its nuclide; infinite from all others."""
+def _apart_m(s: Sources, strength: jax.Array) -> jax.Array:
+    """Distances [K, K] of each source from each of its nuclide of more ``strength`` [K]; infinite from all others."""
     apart = jnp.linalg.norm(s.place[:, None, :2] - s.place[:, :2], axis=-1)
     alike = (s.nuclide[:, None] == s.nuclide) & s.present[:, None] & s.present
-    return jnp.where(alike & (s.activity_bq[:, None] < s.activity_bq), apart, jnp.inf)
+    numbers = jnp.arange(strength.shape[0])
+    less = (strength[:, None] < strength) | ((strength[:, None] == strength) & (numbers[:, None] > numbers))
+    return jnp.where(alike & less, apart, jnp.inf)
 
 
 def _around(count: int) -> jax.Array:
@@ -149,29 +164,51 @@ def _as_two(problem: Problem, state: State, k: jax.Array, offset_m: jax.Array) -
 
 
 def joined(problem: Problem, state: State) -> tuple[State, jax.Array]:
-    """The state without those that are companions of a stronger source of their nuclide; and whether [] there is any.
+    """The state without those that are companions of a source that explains more; and whether [] there is any.
 
-    It is fitted anew at the places that are left.
+    One is taken away after another, the one that is missed least first, and the others are fitted anew at their places:
+    of two that stand for one another neither is missed.
     """
-    s, apart = state.sources, _apart_m(state.sources)  # [weaker, stronger]
-    near = apart < COMPANION_M
-    ratio = for_those(jnp.any(near), lambda: ratios(problem, state), lambda: jnp.zeros(s.present.shape))
-    beside = near & ((apart < ONE_M) | (ratio[:, None] < COMPANION_RATIO * ratio))
-    companion = jnp.any(beside, axis=1)
+    before, number = state.sources, jnp.arange(state.sources.present.shape[0])
 
-    def join() -> State:
-        left = s.present & ~companion
-        sources = replace(
-            s,
-            present=left,
-            joined_m=jnp.where(left, jnp.max(jnp.where(beside, apart, 0.0), axis=0), 0.0),
-            beside_m=jnp.where(left, _about_mean(s, beside), 0.0),
-        )
-        added = replace(state.added, counts=jnp.where(companion[:, None, None], 0.0, state.added.counts))
-        return settled(problem, replace(state, sources=sources, added=added))
+    def look(carry: _Joining) -> _Joining:
+        s = carry.state.sources
+        some = jnp.any(_apart_m(s, s.activity_bq) < COMPANION_M)
+        ratio = for_those(some, lambda: ratios(problem, carry.state), lambda: jnp.zeros(number.shape))
+        apart = _apart_m(s, ratio)  # [weaker, stronger]
+        beside = (apart < ONE_M) | ((apart < COMPANION_M) & (ratio[:, None] < COMPANION_RATIO * ratio))
+        asked = jnp.any(beside, axis=1)
+        away = jnp.argmin(jnp.where(asked, ratio, jnp.inf))
+        to = jnp.argmin(jnp.where(beside[away], apart[away], jnp.inf))
 
-    some = jnp.any(companion)
-    return for_those(some, join, lambda: state), some
+        def join() -> _Joining:
+            stands_for = jnp.where(carry.stands_for == away, to, carry.stands_for)
+            return _Joining(state=settled(problem, without(carry.state, away)), stands_for=stands_for, over=carry.over)
+
+        return for_those(jnp.any(asked), join, lambda: replace(carry, over=jnp.array(True)))
+
+    start = _Joining(state=state, stands_for=number, over=jnp.array(False))
+    found = repeat_while(lambda carry: ~carry.over, look, start)
+    # of each that is left those that it stands for, at the places and activities that they had
+    beside = (found.stands_for[:, None] == number) & (number[:, None] != number) & before.present[:, None]
+    some = jnp.any(beside)
+    apart = jnp.linalg.norm(before.place[:, None, :2] - before.place[:, :2], axis=-1)
+    sources = replace(
+        found.state.sources,
+        joined_m=jnp.max(jnp.where(beside, apart, 0.0), axis=0),
+        beside_m=_about_mean(before, beside),
+        beside_bq=jnp.sum(jnp.where(beside, before.activity_bq[:, None], 0.0), axis=0),
+    )
+    return replace(found.state, sources=sources), some
+
+
+@pytree
+class _Joining:
+    """How far companions have been taken away."""
+
+    state: State
+    stands_for: jax.Array  # [K] int32, the source that each is counted with: itself, if it is left
+    over: jax.Array  # [] bool
 
 
 def _about_mean(s: Sources, beside: jax.Array) -> jax.Array:

@@ -91,7 +91,8 @@ def find_sources(
         state: what is known already (`no_sources`).
     """
     s = state.sources
-    fresh = replace(s, joined_m=jnp.zeros_like(s.joined_m), beside_m=jnp.zeros_like(s.beside_m))
+    zero = jnp.zeros_like(s.joined_m)
+    fresh = replace(s, joined_m=zero, beside_m=zero, beside_bq=zero)
     state = replace(state, sources=fresh)
     first = settled(problem, replace(state, added=signals(problem, state.sources, state.unknowns.lengths)))
     no = jnp.array(False)
@@ -129,8 +130,10 @@ def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
     Both are sought again, and then tried as all others are.
     """
     sources = p.state.sources
-    open_ = p.over & ~p.closing & ~p.trial & (p.left > 0) & (p.divisions > 0)
-    now = open_ & divisible(sources) & (strain(problem, p.state) > params.further)
+    # enough are left to try them
+    enough = p.left > sources.present.shape[0] + 2
+    open_ = p.over & ~p.closing & ~p.trial & enough & (p.divisions > 0)
+    now = open_ & divisible(sources) & (strain(problem, p.state)[0] > params.further)
 
     def divide() -> _Progress:
         k, slot, ratio, two = divided(problem, p.state)
@@ -177,6 +180,7 @@ def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.
         less = replace(p, state=settled(problem, without(p.state, k)), before=p.state)
         least = params.further
         less = replace(less, trial=ratio[k] >= least, again=less.state.sources.present)
+        less = replace(less, divisions=_divisions(p, ratio[k] < least))
         return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * least), less, p)
 
     return for_those(now, begin, lambda: p)
@@ -186,7 +190,12 @@ def _ended_trial(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
     """``now``: the sources before the trial, unless those left explain the counts as well, within ``least`` []."""
     needless = 2.0 * (p.before.likelihood - p.state.likelihood) < least
     kept = jax.tree.map(partial(jnp.where, now & ~needless), p.before, p.state)
-    return replace(p, state=kept, trial=p.trial & ~now)
+    return replace(p, state=kept, trial=p.trial & ~now, divisions=_divisions(p, now & needless))
+
+
+def _divisions(p: _Progress, removed: jax.Array) -> jax.Array:
+    """How many more there may be: none once one that came of a division was ``removed`` [], for it would come again."""
+    return jnp.where(removed & (p.divisions < DIVISIONS), 0, p.divisions)
 
 
 def _sought(
@@ -214,7 +223,9 @@ def _sought(
     def look() -> tuple[State, jax.Array]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
-        found = ~adding | (ratio > jnp.where(jnp.any(s.present), params.further, params.threshold))
+        # what is sought again stays where it is rather than at a place that explains much less
+        least = jnp.where(jnp.any(s.present), params.further, params.threshold)
+        found = ratio > jnp.where(adding, least, -HOPELESS * params.further)
         after = _with(problem, state, slot, best)
         kept = jnp.where(adding | wide, values, s.nuclide_value[slot])
         table = after.sources.nuclide_value.at[slot].set(kept)

@@ -26,6 +26,7 @@ class Sources:
     towards: jax.Array  # [K, 3, 3] information about its place (`Settled.towards`)
     joined_m: jax.Array  # [K] how far off another one of its nuclide was that was taken away; 0: there was none
     beside_m: jax.Array  # [K] root of the second moment of it and such others about their mean, by activity
+    beside_bq: jax.Array  # [K] activity of such others
 
 
 @pytree
@@ -51,6 +52,7 @@ def no_sources(problem: Problem, count: int, nuclides: int) -> State:
             towards=jnp.zeros((count, 3, 3)),
             joined_m=zero,
             beside_m=zero,
+            beside_bq=zero,
         ),
         added=Others(
             counts=jnp.zeros((count, *problem.background.shape)), variance=jnp.zeros((count, len(problem.background)))

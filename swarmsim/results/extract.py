@@ -321,7 +321,9 @@ def _verdict(
     of_vehicle = used[samples.vehicle]
     highest = np.array([highest_rate(detector) for detector in detectors])
     background = np.array([float(detector.background_cps) for detector in detectors])
-    fit = Fit(misfit=float(estimated.misfit), chi_squared=float(estimated.chi_squared))
+    fit = Fit(
+        misfit=float(estimated.misfit), chi_squared=float(estimated.chi_squared), strain=float(estimated.strain)
+    )  # fmt: skip
     ground = height_at(simulation.site_model.site, np.asarray(samples.position_m, float)[:, :2])
     return assess(
         samples,
@@ -333,6 +335,7 @@ def _verdict(
         final,
         float(presumed.background_std),
         (float(np.exp(presumed.log_activity)) * 1e-6, float(presumed.log_activity_std)),
+        gamma_constants(simulation, final),
     )
 
 

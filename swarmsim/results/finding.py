@@ -45,9 +45,11 @@ def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool,
 
 def _beside(final: tuple[Estimate, ...]) -> str:
     """What another source beside each of those found would have to be to be noticed."""
-    limits = [f"from {one.beside_mbq:.2g} MBq on" if math.isfinite(one.beside_mbq) else "never" for one in final]
+    limits = [
+        f"noticed from {in_mbq(one.beside_mbq)} on" if math.isfinite(one.beside_mbq) else "missed" for one in final
+    ]  # fmt: skip
     whom = "it" if len(final) == 1 else "each"
-    return f"another one within {COMPANION_M:g} m of {whom} would be noticed {', '.join(limits)}"
+    return f"another one within {COMPANION_M:g} m of {whom} would be {', '.join(limits)}"
 
 
 def _placed(estimate: Estimate) -> str:

@@ -1,8 +1,9 @@
 """What an answer is worth: a status and a sentence, from every diagnostic that the mission computed."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
-from swarmsim.results.record import Estimate, RadiationMap, Samples
+from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
 
 Floats = NDArray[np.floating]
 Status = Literal[
@@ -41,6 +42,7 @@ class Fit:
 
     misfit: float  # standard deviations by which chi-squared exceeds its degrees of freedom
     chi_squared: float  # over its degrees of freedom
+    strain: float = 0.0  # what rates depart from the model by, beyond what is usual (`Estimated.strain`)
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ def assess(
     final: Sequence[Estimate],
     background_std: float,
     activity: tuple[float, float],
+    at_1_m: Mapping[str, GammaConstant] = MappingProxyType({}),
 ) -> Verdict:
     """Judge an answer.
 
@@ -75,6 +78,7 @@ def assess(
         final: sources by all counts, the surest first.
         background_std: how much a background may differ from place to place, of its logarithm.
         activity: what is presumed of a source's, in MBq, and the standard deviation of its logarithm.
+        at_1_m: dose rates of the nuclides that were found, by which the strength of different ones is compared.
     """
     covered = coverage(samples, chart, ground_m)
     reasons = []
@@ -85,7 +89,8 @@ def assess(
     if covered < COVERED_SHARE:
         status = "incomplete_survey" if status in ("none", "located") else status
         reasons.append(f"only {covered:.0%} of the survey area was measured")
-    doubts = _doubts(chart, fit, aerial, final, background_std, activity)
+    strength = [one.activity_mbq * at_1_m[one.nuclide].kerma_ugy_h if at_1_m else one.activity_mbq for one in final]
+    doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity)
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     reasons += [sentence for _, sentence in doubts]
@@ -125,6 +130,7 @@ def _doubts(
     fit: Fit,
     aerial: Sequence[Estimate],
     final: Sequence[Estimate],
+    strength: Sequence[float],
     background_std: float,
     activity: tuple[float, float],
 ) -> list[tuple[Status, str]]:
@@ -137,8 +143,8 @@ def _doubts(
             f"the counts contradict the sources as modelled (chi-squared {fit.chi_squared:.2f} per degree of freedom, "
             f"{fit.misfit:.0f} standard deviations too large)",
         ))  # fmt: skip
-    for one in aerial:
-        found += _disagreement(one, final)
+    # those of a group are compared as one
+    found += dict.fromkeys(doubt for one in aerial for doubt in _disagreement(one, aerial, final))
     for one in final:
         if not one.converged:
             few = (
@@ -149,7 +155,7 @@ def _doubts(
         std = np.sqrt(np.maximum(np.linalg.eigvalsh(np.asarray(one.covariance_m2)[:2, :2])[-1], 0.0))
         if std > FAR_STD_M:
             found.append(("detected", f"the place of the {one.nuclide} source is known to {std:.0f} m only"))
-    found += _companions(final)
+    found += _companions(final, strength)
     found += _implausible(final, *activity)
     found += _unexplained(chart, final, background_std)
     return found
@@ -160,16 +166,17 @@ def in_mbq(activity_mbq: float) -> str:
     return f"{activity_mbq:.0f} MBq" if activity_mbq >= 10.0 else f"{activity_mbq:.2g} MBq"
 
 
-def _companions(final: Sequence[Estimate]) -> list[tuple[Status, str]]:
+def _companions(final: Sequence[Estimate], strength: Sequence[float]) -> list[tuple[Status, str]]:
     """Faint sources beside a strong one of the same nuclide, or any two at one place: errors of the model of walls."""
     found: list[tuple[Status, str]] = []
-    for pair in itertools.combinations(final, 2):
-        faint, strong = sorted(pair, key=lambda one: one.activity_mbq)
-        apart = float(np.linalg.norm(np.asarray(faint.position_m)[:2] - np.asarray(strong.position_m)[:2]))
-        share = faint.activity_mbq / max(strong.activity_mbq, 1e-12)
+    for pair in itertools.combinations(zip(final, strength, strict=True), 2):
+        (faint, less), (strong, more) = sorted(pair, key=lambda one: one[1])
+        apart = _apart_m(faint, strong)
+        share = less / max(more, 1e-30)
         alike = faint.nuclide == strong.nuclide and apart < (COMPANION_M if share < COMPANION_SHARE else ONE_M)
         # what the model does not explain about a source is taken up by others near it, of any nuclide
-        taken_up = (strong.joined_m > 0.0 and apart < COMPANION_M) or (share < FAINT_SHARE and apart < FAINT_M)
+        several = max(strong.joined_m, faint.joined_m) > 0.0 and apart < COMPANION_M
+        taken_up = several or (share < FAINT_SHARE and apart < FAINT_M)
         if alike or taken_up:
             other = "a stronger one" if share < 1.0 else "another one"
             text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
@@ -207,28 +214,47 @@ def _unexplained(chart: RadiationMap, final: Sequence[Estimate], background_std:
     return [("ambiguous", f"hotspots far from what was found suggest further sources, at {text} m")]
 
 
-def _disagreement(before: Estimate, sources: Sequence[Estimate]) -> list[tuple[Status, str]]:
-    """Between a source of the survey and the nearest of the same nuclide by all counts, with those beside it."""
+def _disagreement(
+    before: Estimate, survey: Sequence[Estimate], sources: Sequence[Estimate]
+) -> list[tuple[Status, str]]:
+    """Between a source of the survey and the nearest of the same nuclide by all counts, each with those beside it."""
     alike = [one for one in sources if one.nuclide == before.nuclide]
     if not alike:
         return []
-    place = np.asarray(before.position_m, float)[:2]
-    places = np.array([np.asarray(one.position_m, float)[:2] for one in alike])
-    nearest = int(np.argmin(np.linalg.norm(places - place, axis=1)))
-    # the survey cannot tell sources beside one another apart
-    beside = np.linalg.norm(places - places[nearest], axis=1) < COMPANION_M
-    final, group = alike[nearest], [one for one, near in zip(alike, beside, strict=True) if near]
-    activity = np.array([max(one.activity_mbq, 1e-9) for one in group])
-    apart = activity @ places[beside] / np.sum(activity) - place
-    covariance = np.asarray(final.covariance_m2)[:2, :2] + np.asarray(before.covariance_m2)[:2, :2]
-    covariance = covariance + MODEL_STD_M**2 * np.eye(2)
+    final = min(alike, key=lambda one: _apart_m(one, before))
+    # the survey tells sources beside one another apart no better than it can
+    first, last = _beside(before, survey), _beside(final, sources)
+    (begun, of_first), (ended, of_last) = _centre(first), _centre(last)
+    apart, covariance = ended - begun, of_first + of_last + MODEL_STD_M**2 * np.eye(2)
     if float(apart @ np.linalg.solve(covariance, apart)) > APART_SIGMA**2:
         distance = float(np.linalg.norm(apart))
         text = f"the {final.nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
         return [("inconsistent", text)]
-    shares = [float(e.activity_std_mbq) / max(e.activity_mbq, 1e-9) for e in (before, final)]
-    ratio = np.log(np.sum(activity) / max(before.activity_mbq, 1e-9))
-    if abs(ratio) > APART_SIGMA * np.hypot(np.hypot(shares[0], shares[1]), MODEL_STD_LOG):
+    totals = [sum(max(one.activity_mbq, 1e-9) for one in group) for group in (first, last)]
+    stds = [max(one.activity_std_mbq for one in group) for group in (first, last)]
+    ratio = np.log(totals[1] / totals[0])
+    if abs(ratio) > APART_SIGMA * np.hypot(np.hypot(stds[0] / totals[0], stds[1] / totals[1]), MODEL_STD_LOG):
         text = f"the activity of the {final.nuclide} source by the survey and by all counts differs "
         return [("inconsistent", f"{text}{np.exp(abs(ratio)):.3g} times")]
     return []
+
+
+def _apart_m(one: Estimate, other: Estimate) -> float:
+    return float(np.linalg.norm(np.asarray(one.position_m, float)[:2] - np.asarray(other.position_m, float)[:2]))
+
+
+def _beside(one: Estimate, found: Sequence[Estimate]) -> list[Estimate]:
+    """It, and those of its nuclide that are so near that their rates rise and fall with its own."""
+    return [one] + [
+        other for other in found
+        if other is not one and other.nuclide == one.nuclide and _apart_m(other, one) < COMPANION_M
+    ]  # fmt: skip
+
+
+def _centre(group: Sequence[Estimate]) -> tuple[Floats, Floats]:
+    """Centre of activity [2] and its covariance [2, 2], the errors of its members taken for one error."""
+    activity = np.array([max(one.activity_mbq, 1e-9) for one in group])
+    share = activity / np.sum(activity)
+    places = np.array([np.asarray(one.position_m, float)[:2] for one in group])
+    covariances = np.array([np.asarray(one.covariance_m2, float)[:2, :2] for one in group])
+    return share @ places, np.tensordot(share, covariances, axes=1)

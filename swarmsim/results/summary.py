@@ -183,8 +183,8 @@ def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[s
     ``error_m`` is the distance in space, ``error_horizontal_m`` the distance on the map; ``activity_error_percent`` is
     the size of the error over the true activity. ``several_within_m`` is there where it may be several sources, so near
     to one another; ``beside_noticed_mbq`` is the activity from which on another one of its nuclide, 3 to 12 m off,
-    would have been noticed (`Estimate.beside_mbq`). Dose rates 1 m from the source are those of its activity with nothing
-    around it; their standard deviations are the activity's, for the nuclide that was estimated.
+    would have been noticed (`Estimate.beside_mbq`). Dose rates 1 m from the source are those of its activity with
+    nothing around it; their standard deviations are the activity's, for the nuclide that was estimated.
     """
     if estimate is None:
         return dict.fromkeys(_ESTIMATE_KEYS)

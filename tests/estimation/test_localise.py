@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from swarmsim.config.mission import Knowledge
+from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.localise import problem_of, sampled
 from swarmsim.estimation.pairs import joined, strain
-from swarmsim.estimation.posterior import Posterior
 from swarmsim.estimation.state import settled, signals
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE, SPANS
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed

@@ -13,18 +13,16 @@ from scipy.stats import multivariate_normal
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import ways_from
-from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.posterior import (
+from swarmsim.estimation.importance_sampling import (
     SCALES,
-    WEIGH_STEPS,
     Weighed,
     _log_weights,
     _Rounds,
     _with_round,
-    mirrored_place,
-    posteriors,
     sample_posterior,
 )
+from swarmsim.estimation.localise import problem_of
+from swarmsim.estimation.posterior import WEIGH_STEPS, mirrored_place, posteriors
 from swarmsim.estimation.search import attempt
 from swarmsim.estimation.state import Sources, no_sources
 from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
@@ -103,6 +101,7 @@ def _state(problem, at):
         towards=fit.towards[None],
         joined_m=jnp.zeros(1),
         beside_m=jnp.zeros(1),
+        beside_bq=jnp.zeros(1),
     )
     counts = fit.unknowns.activity_bq * fit.rates.counts
     unknowns = replace(fit.unknowns, activity_bq=jnp.zeros(()))
