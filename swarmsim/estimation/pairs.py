@@ -27,7 +27,8 @@ AWAY_M = (3.0, 5.5, 9.0)  # of a weaker one, from where the stronger was found
 DIRECTIONS = 12
 AROUND_M = 1.0  # within which the places of both are changed together, in the first round
 CLOSER = 0.6  # the same in a further round, over that in the one before
-ROUNDS = 7
+ROUNDS = 9
+PART = 18  # pairs of places that are tried in a step
 # fractional parts of multiples of these fill four dimensions evenly: powers of the root of x^5 = x + 1 (as in
 # `swarmsim.estimation.importance_sampling`)
 _EVEN = (0.8566749, 0.7338919, 0.6287067, 0.5385972)
@@ -41,10 +42,14 @@ Such errors about sources in barns had 0.001 to 0.07, either of two equal source
 
 
 @pytree
-class Divided:
+class Two:
     """Two sources in the place of one."""
 
-    state: State  # with the first of them in the place of the one
+    number: jax.Array  # [] int32 of that one
+    slot: jax.Array  # [] int32 of the second
+    offset_m: jax.Array  # [2, 2] of both from where the one was
+    place: jax.Array  # [3] of the first
+    first: Others  # what it adds [n, R], [n]
     second: Tried
 
 
@@ -70,12 +75,11 @@ def divisible(s: Sources) -> jax.Array:
     return jnp.any(s.present) & (~jnp.all(s.present) | _nearest(s)[2])
 
 
-def divided(problem: Problem, state: State) -> tuple[jax.Array, jax.Array, jax.Array, Divided]:
+def divided(problem: Problem, state: State) -> tuple[Two, State, jax.Array]:
     """Two sources in the place of one; the two nearest to one another, if they are companions, are placed anew.
 
     Returns:
-        the number of the first, that of the second [], twice the logarithm of the likelihood ratio [] over the state,
-        and the two.
+        the two, the state with the first of them, and twice the logarithm of the likelihood ratio [] over ``state``.
     """
     s = state.sources
     stronger, weaker, beside = _nearest(s)
@@ -84,35 +88,51 @@ def divided(problem: Problem, state: State) -> tuple[jax.Array, jax.Array, jax.A
     starts = _offsets()
     here = jnp.stack([jnp.zeros(2), s.place[weaker, :2] - s.place[stronger, :2]])
     anew = here + _around(starts.shape[0]) * AROUND_M
+    parts = starts.shape[0] // PART
+    looks = parts * numbers.shape[0]
 
     def base(k: jax.Array) -> tuple[jax.Array, State]:
         """Whether [] the source ``k`` is one of a pair that is placed anew, and the state with that one alone."""
         again = beside & (k == stronger)
         return again, jax.tree.map(partial(jnp.where, again), pair, state)
 
-    def likelihoods(k: jax.Array, offsets: jax.Array) -> jax.Array:
-        rest = base(k)[1]
-        return each(lambda x: _as_two(problem, rest, k, x).second.fit.likelihood, offsets, TOGETHER)
+    def look(number: jax.Array, best: Two) -> Two:
+        seeking = number < looks
+        k = jnp.where(seeking, number // parts, best.number)
+        again, rest = base(k)
+        first = jnp.where(again, anew, starts).reshape(parts, PART, 2, 2)[number % parts]
+        closer = best.offset_m + _around(PART) * AROUND_M * CLOSER ** (number - looks)
+        offsets = jnp.where(seeking, first, closer)
+        possible = again | ~(full | (beside & (k == weaker)))
+        asked = jnp.where(seeking, s.present[k] & possible, best.second.fit.likelihood > -jnp.inf)
+        slot = jnp.where(again, weaker, jnp.argmin(s.present)).astype(jnp.int32)
 
-    def of_source(k: jax.Array) -> jax.Array:
-        again, nothing = base(k)[0], jnp.full(starts.shape[0], -jnp.inf)
-        asked = s.present[k] & (again | ~(full | (beside & (k == weaker))))
-        return for_those(asked, lambda: likelihoods(k, jnp.where(again, anew, starts)), lambda: nothing)
+        def best_of() -> Two:
+            two = each(lambda x: _as_two(problem, rest, k, slot, x), offsets, TOGETHER)
+            top = jnp.argmax(two.second.fit.likelihood)
+            found = jax.tree.map(lambda x: x[top], two)
+            better = found.second.fit.likelihood > best.second.fit.likelihood
+            return jax.tree.map(partial(jnp.where, better), found, best)
 
-    value = jax.lax.map(of_source, numbers)
-    k, number = jnp.unravel_index(jnp.argmax(value), value.shape)
-    again, rest = base(k)
+        return for_those(asked, best_of, lambda: best)
 
-    def closer(number: jax.Array, best: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        offsets = best[0] + _around(TOGETHER) * AROUND_M * CLOSER**number
-        found = likelihoods(k, offsets)
-        top = jnp.argmax(found)
-        return jax.tree.map(partial(jnp.where, found[top] > best[1]), (offsets[top], found[top]), best)
-
-    first = jnp.where(again, anew, starts)[number]
-    offset, likelihood = jax.lax.fori_loop(0, ROUNDS, closer, (first, jnp.max(value)))
-    slot = jnp.where(again, weaker, jnp.argmin(s.present))
-    return k, slot, 2.0 * (likelihood - state.likelihood), _as_two(problem, rest, k, offset)
+    zero = jnp.int32(0)
+    shape = jax.eval_shape(lambda: _as_two(problem, state, zero, zero, starts[0]))
+    nothing: Two = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+    nobody = replace(nothing.second.fit, likelihood=-jnp.asarray(jnp.inf))
+    nothing = replace(nothing, second=replace(nothing.second, fit=nobody))
+    two = jax.lax.fori_loop(0, looks + ROUNDS, look, nothing)
+    k, rest = two.number, base(two.number)[1]
+    sources = replace(
+        rest.sources,
+        place=rest.sources.place.at[k].set(two.place),
+        activity_bq=rest.sources.activity_bq.at[k].multiply(0.5),
+    )
+    added = Others(
+        counts=rest.added.counts.at[k].set(two.first.counts), variance=rest.added.variance.at[k].set(two.first.variance)
+    )
+    with_first = replace(rest, sources=sources, added=added)
+    return two, with_first, 2.0 * (two.second.fit.likelihood - state.likelihood)
 
 
 def _nearest(s: Sources) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -147,20 +167,20 @@ def _offsets() -> jax.Array:
     return jnp.concatenate(sides + [jnp.stack([jnp.zeros_like(way), way], axis=1) * away for away in AWAY_M])
 
 
-def _as_two(problem: Problem, state: State, k: jax.Array, offset_m: jax.Array) -> Divided:
+def _as_two(problem: Problem, state: State, k: jax.Array, slot: jax.Array, offset_m: jax.Array) -> Two:
     """Source ``k`` [] as two, at so far [2, 2] from its place: the first with half of its activity, and a second."""
     s, (low, high) = state.sources, bounds(problem)
     place = jnp.clip(s.place[k] + jnp.pad(offset_m, ((0, 0), (0, 1))), low, high)
     ways = ways_from(problem, place[0])
     found = rates(problem, ways, s.nuclide[k], state.unknowns.lengths)
-    activity = 0.5 * s.activity_bq[k]
-    added = Others(
-        counts=state.added.counts.at[k].set(activity * found.counts),
-        variance=state.added.variance.at[k].set(variance_of(problem, ways.position_m) + found.edge),
+    first = Others(
+        counts=0.5 * s.activity_bq[k] * found.counts, variance=variance_of(problem, ways.position_m) + found.edge
     )
-    first = replace(s, place=s.place.at[k].set(place[0]), activity_bq=s.activity_bq.at[k].set(activity))
+    added = Others(
+        counts=state.added.counts.at[k].set(first.counts), variance=state.added.variance.at[k].set(first.variance)
+    )
     second = attempt(problem, s.nuclide[k], added, state.unknowns, place[1])
-    return Divided(state=replace(state, sources=first, added=added), second=second)
+    return Two(number=k.astype(jnp.int32), slot=slot, offset_m=offset_m, place=place[0], first=first, second=second)
 
 
 def joined(problem: Problem, state: State) -> tuple[State, jax.Array]:

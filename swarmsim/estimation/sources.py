@@ -136,11 +136,11 @@ def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
     now = open_ & divisible(sources) & (strain(problem, p.state)[0] > params.further)
 
     def divide() -> _Progress:
-        k, slot, ratio, two = divided(problem, p.state)
-        state, numbers = _with(problem, two.state, slot, two.second), jnp.arange(sources.present.shape[0])
-        table = state.sources.nuclide_value.at[slot].set(state.sources.nuclide_value[k])
+        two, state, ratio = divided(problem, p.state)
+        state, numbers = _with(problem, state, two.slot, two.second), jnp.arange(sources.present.shape[0])
+        table = state.sources.nuclide_value.at[two.slot].set(state.sources.nuclide_value[two.number])
         state = replace(state, sources=replace(state.sources, nuclide_value=table))
-        both = (numbers == k) | (numbers == slot)
+        both = (numbers == two.number) | (numbers == two.slot)
         after = replace(p, state=state, again=both, over=jnp.array(False), divisions=p.divisions - 1)
         better = ratio > HOPELESS * params.further
         # what cannot be divided now cannot be later
