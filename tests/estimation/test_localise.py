@@ -9,10 +9,8 @@ import pytest
 
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.importance_sampling import Posterior
-from swarmsim.estimation.localise import problem_of, sampled
-from swarmsim.estimation.pairs import joined, strain
-from swarmsim.estimation.state import settled, signals
-from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE, SPANS
+from swarmsim.estimation.localise import sampled
+from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
 pytestmark = pytest.mark.optimised
@@ -109,30 +107,6 @@ def test_two_sources_of_different_nuclides_are_both_found(localiser, seed):
     assert float(estimated.fits.detection[0]) >= float(estimated.fits.detection[1])
 
 
-@pytest.mark.parametrize(
-    ("apart", "nuclides", "one"),
-    [(2.0, (0, 0), True), (7.0, (0, 0), True), (20.0, (0, 0), False), (2.0, (0, 1), False)],
-)
-def test_companions_of_a_nuclide_are_told_as_one(localiser, apart, nuclides, one):
-    """The counts are those of one source: the weaker is taken away, but not where it is another, or far off."""
-    problem = problem_of(localiser.presumed, drawn(BOTH, mean_rois(SITE, DETECTORS, BOTH, CO_60), 3), SPANS)
-    here = jnp.array([*SOURCE[:2], 1.0])
-    sources = replace(
-        localiser.nothing.sources, present=jnp.array([True, True]), nuclide=jnp.array(nuclides),
-        place=jnp.stack([here + jnp.array([apart, 0.0, 0.0]), here]), activity_bq=ACTIVITY * jnp.array([0.02, 1.0]),
-    )  # fmt: skip
-    added = signals(problem, sources, localiser.nothing.unknowns.lengths)
-    state = settled(problem, replace(localiser.nothing, sources=sources, added=added))
-    after, some = joined(problem, state)
-    assert after.sources.present.tolist() == [not one, True]
-    assert bool(some) == one
-    share = float(state.sources.activity_bq[0] / jnp.sum(state.sources.activity_bq))
-    told = [apart, apart * np.sqrt(share * (1.0 - share))] if one else [0.0, 0.0]
-    np.testing.assert_allclose(after.sources.joined_m, [0.0, told[0]], rtol=1e-4)
-    np.testing.assert_allclose(after.sources.beside_m, [0.0, told[1]], rtol=1e-3)
-    assert float(jnp.max(jnp.abs(after.added.counts[0]))) == 0.0 or not one
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("apart", [4.0, 7.0])
 def test_two_of_a_nuclide_beside_one_another_are_two(localiser, apart, seed):
@@ -149,21 +123,6 @@ def test_two_of_a_nuclide_beside_one_another_are_two(localiser, apart, seed):
     assert all(min(np.linalg.norm(found - one[:2], axis=1)) < 0.5 for one in truth)
     np.testing.assert_allclose(np.sum(np.asarray(fits.activity_bq)), 400e6, rtol=0.1)
     assert float(estimated.misfit) < 4.0
-
-
-def test_one_source_strains_nothing_and_two_taken_for_one_do(localiser):
-    strains, nothing = [], localiser.nothing
-    for apart in (0.0, 4.0):
-        truth = [(np.add(SOURCE, [x, 0.0, 0.0]), 0.5 * ACTIVITY, "Co-60") for x in (-0.5 * apart, 0.5 * apart)]
-        problem = problem_of(localiser.presumed, drawn(BOTH, mean_rois(SITE, DETECTORS, BOTH, truth), 5), SPANS)
-        one = replace(
-            nothing.sources, present=jnp.array([True, False]), activity_bq=jnp.array([ACTIVITY, 0.0]),
-            place=nothing.sources.place.at[0].set(jnp.array([*SOURCE[:2], 1.0])),
-        )  # fmt: skip
-        added = signals(problem, one, nothing.unknowns.lengths)
-        strains.append(float(strain(problem, settled(problem, replace(nothing, sources=one, added=added)))))
-    assert strains[0] < 30.0
-    assert strains[1] > 2.0 * float(localiser.params.search.further)
 
 
 def test_no_more_sources_are_found_than_there_is_room_for(localiser):

@@ -1,0 +1,224 @@
+"""Sources of one nuclide beside one another: one that is rather two, two that are rather one, and what is not known."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from swarmsim.estimation import localisation_params, pairs, sources
+from swarmsim.estimation.likelihood import position_of
+from swarmsim.estimation.localise import problem_of
+from swarmsim.estimation.pairs import divided, joined, strain
+from swarmsim.estimation.posterior import of_others
+from swarmsim.estimation.search import looked_at, screen_of
+from swarmsim.estimation.sources import as_known
+from swarmsim.estimation.state import no_sources, settled, signals, without
+from tests.estimation.conftest import BOTH, DETECTORS, NOWHERE, SPANS
+from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, drawn, mean_rois, place, presumed, spec
+
+SITE = place(NOWHERE)
+KNOWN, PARAMS = presumed(SITE, DETECTORS), localisation_params(spec())
+CERTAIN = replace(KNOWN, background_std=jnp.float32(0.01), model_std=jnp.float32(0.001), height_std_m=jnp.float32(0.05))
+AT = np.array([*SOURCE[:2], 1.0])
+
+
+def state_of(truth, given=None, known=KNOWN, seed=None, nuclides=None):
+    """The problem of the counts of ``truth``, and a state with the sources ``given``: (place, activity) each."""
+    mean = mean_rois(SITE, DETECTORS, BOTH, [(at, activity, "Co-60") for at, activity in truth])
+    problem = problem_of(known, drawn(BOTH, mean, seed) if seed is not None else replace(BOTH, rois=mean), SPANS)
+    if known is CERTAIN:
+        problem = replace(problem, pose_std_m=jnp.zeros_like(problem.pose_std_m))
+    given = truth if given is None else given
+    nothing = no_sources(problem, len(given), len(NUCLIDES))
+    found = replace(
+        nothing.sources,
+        present=jnp.ones(len(given), bool),
+        nuclide=jnp.array(nuclides or [0] * len(given)),
+        place=jnp.array([at for at, _ in given], jnp.float32),
+        activity_bq=jnp.array([activity for _, activity in given], jnp.float32),
+    )
+    added = signals(problem, found, nothing.unknowns.lengths)
+    return problem, settled(problem, replace(nothing, sources=found, added=added))
+
+
+def east(metres):
+    return AT + np.array([metres, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("apart", "nuclides", "one"),
+    [(2.0, (0, 0), True), (7.0, (0, 0), True), (20.0, (0, 0), False), (2.0, (0, 1), False)],
+)
+def test_companions_of_a_nuclide_are_told_as_one(apart, nuclides, one):
+    """The counts are those of one source: the weaker is taken away, but not where it is another, or far off."""
+    problem, state = state_of(
+        [(AT, ACTIVITY)], [(east(apart), 0.02 * ACTIVITY), (AT, ACTIVITY)], seed=3, nuclides=list(nuclides)
+    )
+    after, some = joined(problem, state)
+    assert after.sources.present.tolist() == [not one, True]
+    assert bool(some) == one
+    share = float(state.sources.activity_bq[0] / jnp.sum(state.sources.activity_bq))
+    told = [apart, apart * np.sqrt(share * (1.0 - share))] if one else [0.0, 0.0]
+    np.testing.assert_allclose(after.sources.joined_m, [0.0, told[0]], rtol=1e-4)
+    np.testing.assert_allclose(after.sources.beside_m, [0.0, told[1]], rtol=1e-3)
+    assert float(jnp.max(jnp.abs(after.added.counts[0]))) == 0.0 or not one
+    told_bq = float(state.sources.activity_bq[0]) if one else 0.0
+    np.testing.assert_allclose(after.sources.beside_bq, [0.0, told_bq], rtol=1e-6)
+
+
+def joined_by(monkeypatch, places_m, activities, ratios):
+    """What `joined` makes of sources on a line with such likelihood ratios."""
+    monkeypatch.setattr(
+        pairs, "ratios", lambda problem, state: jnp.where(state.sources.present, jnp.array(ratios), 0.0)
+    )
+    problem, state = state_of([(east(x), a) for x, a in zip(places_m, activities, strict=True)])
+    after, some = joined(problem, state)
+    assert bool(some) == (not bool(jnp.all(after.sources.present)))
+    return after.sources
+
+
+def test_of_two_that_stand_for_one_another_one_stays(monkeypatch):
+    """A source 9 m from a stronger one, that is told as two 0.4 m apart: neither of these is missed by itself."""
+    truth = [(AT, 248e6), (east(9.0), 351e6)]
+    problem, state = state_of(truth, [(AT, 248e6), (east(9.0), 188e6), (east(9.4), 163e6)])
+    after = joined(problem, state)[0].sources
+    assert int(jnp.sum(after.present)) == 2
+    assert bool(after.present[0])
+    second = int(jnp.argmax(after.present[1:])) + 1
+    assert float(after.joined_m[second]) == pytest.approx(0.4, rel=1e-3)
+    assert float(after.joined_m[0]) == 0.0
+    assert float(after.activity_bq[second]) == pytest.approx(351e6, rel=0.1)
+
+
+def test_what_a_companion_stands_for_goes_with_it(monkeypatch):
+    after = joined_by(monkeypatch, [0.0, 10.0, 20.0], [300e6, 50e6, 5e6], [9000.0, 900.0, 90.0])
+    assert after.present.tolist() == [True, False, False]
+    assert float(after.joined_m[0]) == pytest.approx(20.0, rel=1e-4)
+    # what explains much is taken away by none
+    after = joined_by(monkeypatch, [0.0, 10.0, 20.0], [300e6, 50e6, 5e6], [9000.0, 8000.0, 90.0])
+    assert after.present.tolist() == [True, True, False]
+    assert after.joined_m.tolist() == pytest.approx([0.0, 10.0, 0.0], rel=1e-4)
+
+
+def test_the_one_that_explains_less_is_taken_away_whatever_its_activity(monkeypatch):
+    after = joined_by(monkeypatch, [0.0, 2.0], [100e6, 400e6], [9000.0, 70.0])
+    assert after.present.tolist() == [True, False]
+    after = joined_by(monkeypatch, [0.0, 2.0], [100e6, 100e6], [500.0, 500.0])
+    assert int(jnp.sum(after.present)) == 1
+
+
+def test_a_source_is_divided_where_two_others_beside_one_another_are_right():
+    """Strain comes from the third, that is two 4 m apart: it is divided, and not the pair placed anew."""
+    pair = [(np.array([-35.0, -30.0, 1.0]), 300e6), (np.array([-35.0, -20.0, 1.0]), 300e6)]
+    halves = [(east(-2.0), 170e6), (east(2.0), 170e6)]
+    problem, state = state_of([*pair, *halves], [*pair, (AT, 340e6)], seed=2)
+    sources_ = jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])]), state.sources)
+    others = replace(state.unknowns, others=jnp.ones(4))
+    added = jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])]), state.added)
+    state = replace(state, sources=sources_, unknowns=others, added=added)
+    two, with_first, ratio = jax.jit(divided)(problem, state)
+    assert int(two.number) == 2
+    assert int(two.slot) == 3
+    assert float(ratio) > float(PARAMS.search.further)
+    found = np.sort([float(with_first.sources.place[2, 0]), float(two.second.place[0])])
+    np.testing.assert_allclose(found, SOURCE[0] + np.array([-2.0, 2.0]), atol=0.5)
+
+
+def test_one_source_strains_nothing_and_two_taken_for_one_do():
+    strains = []
+    for apart in (0.0, 4.0):
+        truth = [(east(x), 0.5 * ACTIVITY) for x in (-0.5 * apart, 0.5 * apart)]
+        found, usual = strain(*state_of(truth, [(AT, ACTIVITY)], seed=5))
+        strains.append(float(found))
+        assert 0.0 < float(usual) < 1.41 * 360
+    assert strains[0] < 30.0
+    assert strains[1] > 2.0 * float(PARAMS.search.further)
+
+
+def columns_of(truth):
+    """Means [n, R] of the counts, and their derivatives [4 K, n, R] by place and log activity of each source."""
+    theta = np.array([[*at, np.log(activity)] for at, activity in truth])
+
+    def means(theta):
+        return np.asarray(mean_rois(SITE, DETECTORS, BOTH, [(t[:3], np.exp(t[3]), "Co-60") for t in theta]), float)
+
+    slopes = []
+    for k in range(len(truth)):
+        for axis, step in enumerate((0.2, 0.2, 0.2, 0.02)):
+            change = np.zeros_like(theta)
+            change[k, axis] = step
+            slopes.append((means(theta + change) - means(theta - change)) / (2.0 * step))
+    return means(theta), np.array(slopes)
+
+
+@pytest.mark.parametrize("apart", [4.0, 9.0])
+def test_what_others_places_add_is_that_of_the_information_about_all(apart):
+    """Fisher information by central differences, where only sources and the levels of the background are unknown."""
+    truth = [(east(0.0), 200e6), (east(apart), 150e6)]
+    problem, state = state_of(truth, known=CERTAIN)
+    mean, slopes = columns_of(truth)
+    levels = [np.asarray(problem.background) * (np.asarray(BOTH.detector) == d)[:, None] for d in range(2)]
+    slopes = np.concatenate([slopes, levels])
+    weight = np.asarray(problem.trust) / np.maximum(mean, 1e-9)
+    information = np.einsum("anr,bnr,nr->ab", slopes, slopes, weight)
+    own, across = information[:8, :8], information[:8, 8:]
+    information = float(problem.learning_rate) * (own - across @ np.linalg.solve(information[8:, 8:], across.T))
+    information += np.diag(np.tile([1e-6, 1e-6, 1.0 / float(problem.height_std_m) ** 2, 1e-6], 2))
+    every = np.linalg.inv(information)
+    added = np.asarray(of_others(problem, state))
+    for k, own in enumerate((slice(0, 4), slice(4, 8))):
+        free = [i for i in range(8) if own.start <= i < own.stop or i % 4 == 3]
+        held = np.linalg.inv(information[np.ix_(free, free)])
+        here = [free.index(i) for i in range(own.start, own.stop)]
+        expected = (every[own, own] - held[np.ix_(here, here)])[[0, 1, 3], [0, 1, 3]]
+        np.testing.assert_allclose(added[k][[0, 1, 3], [0, 1, 3]], expected, rtol=0.25, atol=0.05 * expected.max())
+
+
+def test_nothing_is_added_where_others_are_far_off():
+    problem, state = state_of([(AT, 200e6), (AT - [45.0, 30.0, 0.0], 200e6)])
+    assert float(jnp.max(jnp.abs(of_others(problem, state)))) == 0.0
+
+
+@pytest.mark.parametrize("apart", [3.0, 8.0, 12.0])
+def test_what_is_known_of_another_source_beside_one_is_the_information_about_both(apart):
+    problem, state = state_of([(AT, 200e6)], known=CERTAIN)
+    slopes = columns_of([(AT, 200e6), (east(apart), 4e6)])[1]
+    mean = np.asarray(mean_rois(SITE, DETECTORS, BOTH, [(AT, 200e6, "Co-60")]), float)
+    weight = np.asarray(problem.trust) / np.maximum(mean, 1e-9)
+    one, other = slopes[3], slopes[7] / 4e6
+    products = [np.sum(a * b * weight) for a, b in ((other, other), (one, other), (one, one))]
+    expected = products[0] - products[1] ** 2 / products[2]
+    rest = without(state, jnp.int32(0)).added
+    best = as_known(problem, state, jnp.int32(0), jnp.array(False)).fit
+    screen = screen_of(problem, rest, best.rates, position_of(SITE, state.sources.place[0]), best.unknowns)
+    found = looked_at(problem, screen, jnp.int32(0), jnp.asarray(east(apart), jnp.float32))[1]
+    assert float(found) == pytest.approx(expected, rel=0.05)
+
+
+def test_what_is_sought_again_does_not_go_where_it_explains_less(monkeypatch):
+    problem, state = state_of([(AT, ACTIVITY)], seed=1)
+    no, allowed = jnp.array(False), jnp.ones(len(NUCLIDES), bool)
+    points = jnp.asarray(KNOWN.points_m)[:4]
+    for loss, stays in ((100.0, True), (-1.0, False)):
+        tried = as_known(problem, state, jnp.int32(0), no)
+        fit = replace(tried.fit, likelihood=state.likelihood - loss)
+        elsewhere = replace(tried, place=tried.place + 3.0, fit=fit)
+        monkeypatch.setattr(sources, "_best", lambda *_, found=elsewhere: (found, jnp.zeros(len(NUCLIDES))))
+        after, _ = sources._sought(problem, points, allowed, PARAMS.search, state, jnp.int32(0), no, no)
+        assert bool(jnp.allclose(after.sources.place[0], tried.place)) == stays
+
+
+def test_what_a_division_made_and_a_trial_refuted_is_not_made_again():
+    _, state = state_of([(AT, ACTIVITY)])
+    begun = sources._Progress(
+        state=state, again=jnp.array([False]), wide=jnp.array(False), trial=jnp.array(True), before=state,
+        over=jnp.array(False), left=jnp.int32(9), divisions=jnp.int32(sources.DIVISIONS - 1), closing=jnp.array(False),
+    )  # fmt: skip
+    worse = replace(begun, before=replace(state, likelihood=state.likelihood + 1000.0))
+    least = PARAMS.search.further
+    assert int(sources._ended_trial(least, begun, jnp.array(True)).divisions) == 0
+    assert int(sources._ended_trial(least, worse, jnp.array(True)).divisions) == sources.DIVISIONS - 1
+    untouched = replace(begun, divisions=jnp.int32(sources.DIVISIONS))
+    assert int(sources._ended_trial(least, untouched, jnp.array(True)).divisions) == sources.DIVISIONS
