@@ -2,11 +2,12 @@
 
 import re
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
 
-from swarmsim.results.record import Estimate, RadiationMap, Samples
+from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
 from swarmsim.results.status import CERTAIN, Fit, assess, coverage
 
 GOOD = Fit(misfit=0.3, chi_squared=1.01)
@@ -38,15 +39,16 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
 
 
 def verdict(
-    samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0
-):
+    samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0,
+    at_1_m=MappingProxyType({}), presumed=(100.0, 10.0),
+):  # fmt: skip
     samples = survey() if samples is None else samples
     n = len(samples.counts)
     limits = (np.full(n, highest), np.full(n, 94.0))
     return assess(
         samples, chart(hotspots, rate), limits, np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
-        (100.0, float(np.log(10.0))),
+        (presumed[0], float(np.log(presumed[1]))), at_1_m,
     )  # fmt: skip
 
 
@@ -57,8 +59,29 @@ def test_the_survey_is_compared_with_all_sources_beside_one_another() -> None:
     alone = verdict(aerial=survey_of_both, final=(estimate(),))
     assert alone.status == "inconsistent"
     assert "by the survey and by all counts differs 2 times" in " ".join(alone.reasons)
+    # and so are those of the survey that it told apart
+    final = (estimate(), estimate(11.0, activity=60.0))
+    assert (
+        verdict(aerial=(estimate(0.5, activity=165.0), estimate(10.5, activity=62.0)), final=final).status == "located"
+    )
+    # a contradiction of the two is told once
+    moved = verdict(aerial=(estimate(9.0, std=1.0), estimate(19.0, std=1.0)), final=(estimate(), estimate(10.0)))
+    assert moved.reasons == ("the Co-60 source by the survey and by all counts lies 9 m apart",)
     # one farther off is another source
     assert verdict(aerial=survey_of_both, final=(estimate(), estimate(30.0))).status == "inconsistent"
+
+
+def test_different_nuclides_are_compared_by_what_they_add() -> None:
+    """250 GBq of a nuclide of few photons are fainter than 100 MBq of one of many."""
+    at_1_m = {"Co-60": GammaConstant(0.35, 0.30), "Pu-239": GammaConstant(1e-6, 1e-6)}
+    pair = (estimate(activity=222.0), estimate(7.8, activity=1.5e5, nuclide="Pu-239"))
+    said = " ".join(verdict(final=pair, at_1_m=at_1_m, presumed=(222.0, 10.0)).reasons)
+    assert "the Pu-239 source of 150000 MBq 7.8 m beside a stronger one" in said
+    assert "the Co-60 source" not in said
+    # of two that add as much neither is faint
+    even = {"Co-60": GammaConstant(0.35, 0.30), "Am-241": GammaConstant(0.003, 0.0025)}
+    pair = (estimate(activity=5.0), estimate(20.0, activity=600.0, nuclide="Am-241"))
+    assert verdict(final=pair, at_1_m=even, aerial=(estimate(1.0, activity=5.0),)).status == "located"
 
 
 def test_a_good_answer_has_no_reasons() -> None:
@@ -76,6 +99,8 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"samples": survey(rate=2.0)}, "saturated", "dead time"),
         ({"fit": Fit(misfit=20.0, chi_squared=1.6)}, "inconsistent", "chi-squared 1.60"),
         ({"fit": Fit(misfit=np.nan, chi_squared=np.nan)}, "inconsistent", "contradict the sources"),
+        ({"fit": replace(GOOD, strain=600.0)}, "inconsistent", "the rates depart from those of the sources"),
+        ({"fit": replace(GOOD, strain=np.nan)}, "inconsistent", "the rates depart from those of the sources"),
         ({"aerial": (estimate(12.0, std=1.0),)}, "inconsistent", "12 m apart"),
         ({"final": (estimate(activity=19e6),)}, "inconsistent", "times"),
         ({"final": (replace(estimate(), converged=False),)}, "ambiguous", "could not be searched"),
@@ -86,7 +111,17 @@ def test_a_good_answer_has_no_reasons() -> None:
         ({"final": (estimate(), estimate(6.0, activity=20.0))}, "ambiguous", "20 MBq 6 m beside a stronger one"),
         ({"final": (estimate(), estimate(0.3, activity=95.0))}, "ambiguous", "95 MBq 0.3 m beside a stronger one"),
         (
+            {"final": (estimate(), replace(estimate(15.0, activity=95.0), detection=80.0))},
+            "ambiguous",
+            "95 MBq 15 m beside a stronger one",
+        ),
+        (
             {"final": (replace(estimate(), joined_m=2.4), estimate(8.0, activity=90.0))},
+            "ambiguous",
+            "8 m beside a stronger",
+        ),
+        (
+            {"final": (estimate(), replace(estimate(8.0, activity=90.0, nuclide="I-131"), joined_m=2.4))},
             "ambiguous",
             "8 m beside a stronger",
         ),
@@ -113,6 +148,14 @@ def test_each_doubt_has_its_status_and_sentence(given, status: str, said: str) -
     assert found.status == status
     assert found.status not in CERTAIN
     assert any(re.search(said, reason) for reason in found.reasons)
+
+
+def test_a_weak_source_far_from_others_of_its_nuclide_is_believed() -> None:
+    weak = replace(estimate(15.0, activity=95.0), detection=80.0)
+    assert verdict(final=(estimate(), replace(weak, nuclide="Cs-137"))).status == "located"
+    assert verdict(final=(estimate(), replace(weak, detection=300.0))).status == "located"
+    assert verdict(final=(estimate(), replace(weak, position_m=np.array([27.0, 0.0, 1.0])))).status == "located"
+    assert verdict(fit=replace(GOOD, strain=100.0)).status == "located"
 
 
 def test_a_counter_is_saturated_short_of_its_highest_rate() -> None:
