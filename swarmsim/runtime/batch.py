@@ -58,6 +58,8 @@ class Batch:
         idle = on_processor() and self._mesh is None and len(jax.devices()) > 1
         self._cores = Mesh(np.array(jax.devices()), ("core",)) if idle else None
         self._programs: dict[Any, Program] = {}
+        # What a processor computes mission by mission is one program for any number of them.
+        self._one = Batch(1, clock) if _together() == 1 and self._mesh is None and missions > 1 else None
 
     def spread(self, trees: Sequence[Any]) -> "Spread":
         """Arguments of B missions on the devices, from one tree for each mission, or one tree for all.
@@ -122,6 +124,11 @@ class Batch:
             have an axis of evaluations after that of the missions, and were made ``times`` [B] times, as often for
             each mission; the rest of their rows are zero.
         """
+        if self._one is not None and (in_turn or only is not None):
+            made = self._one_by_one(name, function, inputs, carried, common, only, shared)
+            if donate:
+                jax.tree.map(lambda leaf: leaf.delete(), carried)
+            return made
         whole = self._call(name, function, inputs, carried, common, only, in_turn, donate, again, shared)
         program, arguments = whole
         if not shared or self._cores is None:
@@ -129,17 +136,57 @@ class Batch:
         results = program(*jax.device_put(arguments, NamedSharding(self._cores, PartitionSpec())))
         return jax.tree.map(lambda x: x.addressable_shards[0].data, results)
 
+    def _one_by_one(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        inputs: Sequence["Spread"],
+        carried: Any,
+        common: Sequence[Any],
+        only: Any,
+        shared: bool,
+    ) -> Any:
+        """`run` by the program of one mission; a mission that is not asked for keeps what it carries."""
+        one = self._one
+        assert one is not None
+        leaves, structure = jax.tree.flatten(carried)
+        leaves = [np.asarray(leaf) for leaf in leaves]
+        asked = np.arange(self.missions) if only is None else np.flatnonzero(np.asarray(only))
+        made: list[np.ndarray] = [] if only is None else [leaf.copy() for leaf in leaves]
+        for mission in asked:
+            rows = slice(mission, mission + 1)
+            own = jax.tree.unflatten(structure, [one.put(leaf[rows]) for leaf in leaves])
+            chosen = None if only is None else one.put(np.ones(1, bool))
+            result = one.run(
+                name, function, [spread.rows(one, rows) for spread in inputs], own, common,
+                only=chosen, in_turn=only is None, shared=shared,
+            )  # fmt: skip
+            found, structure_ = jax.tree.flatten(result)
+            made = made or [np.zeros((self.missions, *leaf.shape[1:]), leaf.dtype) for leaf in found]
+            for whole, leaf in zip(made, found, strict=True):
+                whole[rows] = leaf
+        return jax.tree.unflatten(structure if only is not None else structure_, [self.put(leaf) for leaf in made])
+
     def prepare(self, calls: Sequence[dict[str, Any]]) -> None:
         """Begin to load or compile the programs of future calls of `run` (its arguments by name), side by side."""
+        prepare([self._prepared(call) for call in calls])
+
+    def _prepared(self, call: dict[str, Any]) -> tuple[Program, Any]:
+        """The program of a call, and what its arguments will be like."""
+        one = self._one
+        if one is not None and (call.get("in_turn") or call.get("only") is not None):
+            first = slice(0, 1)
+            carried = jax.tree.map(lambda leaf: one.put(np.asarray(leaf)[first]), call["carried"])
+            chosen = None if call.get("only") is None else one.put(np.ones(1, bool))
+            spreads = [spread.rows(one, first) for spread in call["inputs"]]
+            alone = {"carried": carried, "inputs": spreads, "only": chosen, "donate": False}
+            return one._prepared(call | alone)
         defaults = {"common": (), "only": None, "in_turn": False, "donate": False, "again": None, "shared": False}
-        work = []
-        for call in calls:
-            program, arguments = self._call(**(defaults | call))
-            if call.get("shared") and self._cores is not None:
-                everywhere = NamedSharding(self._cores, PartitionSpec())
-                arguments = jax.tree.map(partial(_placed, everywhere), arguments)
-            work.append((program, arguments))
-        prepare(work)
+        program, arguments = self._call(**(defaults | call))
+        if call.get("shared") and self._cores is not None:
+            everywhere = NamedSharding(self._cores, PartitionSpec())
+            arguments = jax.tree.map(partial(_placed, everywhere), arguments)
+        return program, arguments
 
     def _call(
         self,
@@ -195,6 +242,11 @@ class Spread:
 
     def __init__(self, structure: Any, carries: tuple[bool, ...], own: list[Any], shared: list[Any]):
         self.structure, self.carries, self.own, self.shared = structure, carries, own, shared
+
+    def rows(self, batch: Batch, rows: slice) -> "Spread":
+        """That of some missions, on the devices of a ``batch`` of as many."""
+        own = [batch.put(np.asarray(leaf)[rows]) for leaf in self.own]
+        return Spread(self.structure, self.carries, own, self.shared)
 
     def of(self, mission: int) -> Any:
         """The pytree of one mission, on the host."""

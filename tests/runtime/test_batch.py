@@ -92,6 +92,20 @@ def test_cores_that_missions_leave_idle_share_what_each_computes(missions, count
         assert len(a.sharding.device_set) == 1
 
 
+@pytest.mark.parametrize("shared", [False, True])
+def test_what_is_done_mission_by_mission_is_one_program_for_any_number_of_them(shared):
+    for count in (1, 2, 3):
+        clock = Clock()
+        missions = Batch(count, clock)
+        inputs = missions.spread([of_mission(scale) for scale in range(1, count + 1)])
+        call = {"name": f"any number {shared}", "function": grown, "inputs": [inputs], "common": (np.float32(0.5),)}
+        call |= {"carried": missions.put(10.0 ** np.arange(count, dtype=np.float32)), "shared": shared}
+        missions.prepare([call | {"in_turn": True}])
+        result = missions.run(**call, in_turn=True)
+        np.testing.assert_array_equal(result, [alone(1.0 + k, 10.0**k) for k in range(count)])
+        assert count == 1 or not clock.compiled
+
+
 def test_shared_work_is_compiled_once_for_preparation_and_calls():
     clock = Clock()
     batch = Batch(1, clock)
