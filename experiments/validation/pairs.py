@@ -5,7 +5,8 @@
 Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no solid obstacle but in buildings too.
 Writes ``pairs.csv`` (a row for each mission) and ``summary.json``: by distance, how many are told as two, as one that
 may be several, or as one; how many of those answers that say that they are sure have both sources in the 95 % region of
-a place that they tell.
+a place that they tell. And of the weaker sources 3 to 12 m from the stronger, by their activity over the one from which
+on the answer says that it would have noticed them: how many it noticed, by telling two or by a doubt.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import numpy as np
 
 import swarmsim
 from experiments.validation.missions import INSIDE_95
+from swarmsim.estimation.pairs import COMPANION_M, ONE_M
 from swarmsim.results.record import MissionRecord
 
 NUCLIDES = ("Co-60", "Cs-137", "Na-22", "I-131", "Eu-152")
@@ -27,6 +29,7 @@ APART_M = (1.0, 2.0, 3.0, 6.0, 14.0)
 ACTIVITY_MBQ = (20.0, 400.0)
 PLACE_M = ((-50.0, 50.0), (20.0, 40.0))  # x, and y to either side of the road in the middle of ``works_yard``
 HEIGHT_M = 1.0
+OF_LIMIT = (0.0, 0.25, 0.5, 1.0, 2.0, np.inf)  # activity over the detection limit
 TRIES = 20  # pairs that are drawn for one in no obstacle
 
 
@@ -134,7 +137,21 @@ def summarised(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "told": {told: sum(row["told"] == told for row in sure) for told in ("two", "may be several", "one")},
             "both_inside_95": sum(inside),
         }
-    return found
+    return found | {"by_limit": _by_limit(rows)}
+
+
+def _by_limit(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
+    """How many weaker sources were noticed, by their activity over the limit that the answer states."""
+    near = [row for row in rows if ONE_M <= row["apart_m"] <= COMPANION_M and row["told"] != "none"]
+    share = np.array([min(row["mbq"]) / (row["beside_mbq"] or np.inf) for row in near])
+    noticed = np.array([row["told"] != "one" or row["status"] != "located" for row in near], bool)
+    return {
+        f"{low:g} to {high:g}": {
+            "sources": int(np.sum((share >= low) & (share < high))),
+            "noticed": int(np.sum(noticed & (share >= low) & (share < high))),
+        }
+        for low, high in itertools.pairwise(OF_LIMIT)
+    }
 
 
 if __name__ == "__main__":

@@ -63,6 +63,12 @@ def test_pairs_are_counted_by_what_was_told_of_them():
     assert found["told"] == {"two": 1, "may be several": 1, "one": 1}
     assert found["both_inside_95"] == 2
     assert pairs.summarised(rows)["6 to 14 m"]["missions"] == 0
+    # 50 of 80 MBq: noticed in two of the answers; that without a source is no answer about one beside it
+    assert rows[0]["beside_mbq"] == 80.0
+    assert rows[3]["beside_mbq"] is None
+    assert pairs.summarised(rows)["by_limit"]["0.5 to 1"] == {"sources": 3, "noticed": 2}
+    never = [pairs.row_of(drawn, record([], [with_joined(estimate(0.0), 0.0, np.inf)], "ambiguous"))]
+    assert pairs.summarised(never)["by_limit"]["0 to 0.25"] == {"sources": 1, "noticed": 1}
 
 
 def test_no_pairs_at_all_are_refused(tmp_path, capsys):
@@ -73,8 +79,8 @@ def test_no_pairs_at_all_are_refused(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def with_joined(one, joined_m):
-    return SimpleNamespace(**vars(one), joined_m=joined_m)
+def with_joined(one, joined_m, beside_mbq=80.0):
+    return SimpleNamespace(**vars(one), joined_m=joined_m, beside_mbq=beside_mbq)
 
 
 def test_errors_are_in_standard_deviations_of_what_was_stated():
