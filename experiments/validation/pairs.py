@@ -6,7 +6,7 @@ Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no
 Writes ``pairs.csv`` (a row for each mission) and ``summary.json``: by distance, how many are told as two, as one that
 may be several, or as one; how many of those answers that say that they are sure have both sources in the 95 % region of
 a place that they tell. And of the weaker sources 3 to 12 m from the stronger, by their activity over the one from which
-on the answer says that it would have noticed them: how many it noticed, by telling two or by a doubt.
+on the answer says that it would have noticed them: how many it told, or told of one with a doubt of any kind.
 """
 
 import argparse
@@ -141,17 +141,19 @@ def summarised(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _by_limit(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:
-    """How many weaker sources were noticed, by their activity over the limit that the answer states."""
+    """How many weaker sources were noticed, by their activity over the limit beside the stronger one."""
     near = [row for row in rows if ONE_M <= row["apart_m"] <= COMPANION_M and row["told"] != "none"]
-    share = np.array([min(row["mbq"]) / (row["beside_mbq"] or np.inf) for row in near])
-    noticed = np.array([row["told"] != "one" or row["status"] != "located" for row in near], bool)
-    return {
-        f"{low:g} to {high:g}": {
-            "sources": int(np.sum((share >= low) & (share < high))),
-            "noticed": int(np.sum(noticed & (share >= low) & (share < high))),
-        }
-        for low, high in itertools.pairwise(OF_LIMIT)
-    }
+    limits = [np.inf if row["beside_mbq"] is None else max(row["beside_mbq"], 0.1) for row in near]
+    share = np.array([min(row["mbq"]) for row in near]) / np.array(limits)
+    told = np.array([row["told"] != "one" for row in near], bool)
+    doubted = np.array([row["told"] == "one" and row["status"] != "located" for row in near], bool)
+    found = {}
+    for low, high in itertools.pairwise(OF_LIMIT):
+        own = (share >= low) & (share < high)
+        found[f"{low:g} to {high:g}"] = {
+            "sources": int(np.sum(own)), "told": int(np.sum(own & told)), "doubted": int(np.sum(own & doubted)),
+        }  # fmt: skip
+    return found
 
 
 if __name__ == "__main__":

@@ -303,7 +303,11 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
     posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
     converged, mean, covariance = sampled(presumed, params, s, posterior)
-    covariance = covariance + of_others(problem, state)
+    more = of_others(problem, state)
+    sound = jnp.isfinite(more).all(axis=(1, 2))
+    converged = converged & sound
+    nothing_told = jnp.square(UNSURE * params.search.reach_m) * jnp.diag(jnp.array([1.0, 1.0, 0.0, 0.0]))
+    covariance = covariance + jnp.where(sound[:, None, None], more, nothing_told)
     # those that were taken away may be a part of it, or it a part of them
     shared_ = jnp.minimum(s.beside_bq / jnp.maximum(s.activity_bq, 1.0), 1.0)
     log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std) + jnp.square(shared_)

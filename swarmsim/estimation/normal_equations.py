@@ -154,6 +154,7 @@ class NormalEquations:
     towards: jax.Array  # [3, 3]
     pull: jax.Array  # [3] derivative by the place, the unknowns marginalised
     log_volume: jax.Array  # [] of the windows' own unknowns, over that of their priors
+    precision: jax.Array  # [2, n] of the priors of a window's own unknowns, there
     fitted: jax.Array  # [] how many of them the data determine
 
 
@@ -219,6 +220,7 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
         towards=whole[p:, p:] - across.T @ inverse @ across,
         pull=push[p:] - across.T @ inverse @ common_push,
         log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(e.determinant * jnp.prod(model.variance, axis=0)), 0.0)),
+        precision=e.precision,
         fitted=jnp.sum(jnp.where(m.valid, 2.0 - told, 0.0)),
     )
 

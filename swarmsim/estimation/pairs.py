@@ -63,7 +63,7 @@ def strain(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
     model = linearised(problem, silent(problem), state.added, jnp.zeros(3), u)
     relative = jnp.square(u.gain) / model.variance[1]
     at = normal_equations(problem, model, u)
-    told = jnp.clip(1.0 - at.own[1, 1] / model.variance[1], 0.0, 1.0)
+    told = jnp.clip(1.0 - at.own[1, 1] * at.precision[1], 0.0, 1.0)
     digamma = jax.scipy.special.digamma
     usual = (tail + 1.0) * (digamma(0.5 * (tail + 1.0)) - digamma(0.5 * tail))
     each_ = (tail + 1.0) * jnp.log1p(relative / tail)
@@ -217,7 +217,8 @@ def joined(problem: Problem, state: State) -> tuple[State, jax.Array]:
         found.state.sources,
         joined_m=jnp.max(jnp.where(beside, apart, 0.0), axis=0),
         beside_m=_about_mean(before, beside),
-        beside_bq=jnp.sum(jnp.where(beside, before.activity_bq[:, None], 0.0), axis=0),
+        # of those nearer it is the sum that the counts tell
+        beside_bq=jnp.sum(jnp.where(beside & (apart > ONE_M), before.activity_bq[:, None], 0.0), axis=0),
     )
     return replace(found.state, sources=sources), some
 

@@ -75,8 +75,9 @@ class Screen:
     own: jax.Array  # [2, R, n] change with the window's own unknowns
     inverse: jax.Array  # [2, 2, n] of the information about those
     registered: jax.Array  # [n] of the counts that are added
-    there: jax.Array  # [R, n] what the source of the fit adds, as it is registered
-    there_own: jax.Array  # [2, n] of it the part that the window's own unknowns take up
+    there: jax.Array  # [C, R, n] change with the source of the fit (log activity, place), and with the other sources
+    there_own: jax.Array  # [C, 2, n] of it the part that the window's own unknowns take up
+    there_inverse: jax.Array  # [C, C] of the information about those
 
 
 def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array, u: Unknowns) -> Screen:
@@ -85,9 +86,14 @@ def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array,
     assert m.rois is not None
     model = linearised(problem, source, others, where, u)
     zero = jnp.zeros_like(u.gain)
-    own, inverse = of_window(model.columns, u.others.shape[0]), normal_equations(problem, model, u).own
+    sources = 1 + u.others.shape[0]
+    own, inverse = of_window(model.columns, sources - 1), normal_equations(problem, model, u).own
     weight = jnp.where(m.valid, problem.trust.T / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
-    there = u.activity_bq * source.counts.T * model.registered
+    there = jnp.concatenate([model.columns[:1], model.columns[0] * model.nearer[:, None], model.columns[1:sources]])
+    inside = jnp.sum(own * (weight * there)[:, None], axis=2)  # [C, 2, n]
+    there_own = jnp.einsum("abn,cbn->can", inverse, inside)
+    information = jnp.einsum("crn,drn->cd", there * weight, there) - jnp.einsum("can,dan->cd", there_own, inside)
+    information = information.at[3, 3].add(height_precision(problem.height_std_m))
     rest = linearised(problem, source, others, where, replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(())))
     return Screen(
         left=jnp.where(m.valid, m.rois.T - rest.mean, 0.0),
@@ -96,13 +102,50 @@ def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array,
         inverse=inverse,
         registered=model.registered,
         there=there,
-        there_own=jnp.einsum("abn,bn->an", inverse, jnp.sum(own * weight * there, axis=1)),
+        there_own=there_own,
+        there_inverse=scaled_inverse(information),
     )
+
+
+@pytree
+class _Seen:
+    """A source of 1 Bq at a place, by a screen."""
+
+    weighted: jax.Array  # [R, n] what it adds over the variance of the counts
+    inside: jax.Array  # [2, n] what the window's own unknowns have of it
+    whole: jax.Array  # [] information about its activity with those known
+    information: jax.Array  # [] and with those unknown
+    score: jax.Array  # []
+
+
+def _seen(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> _Seen:
+    lengths = jnp.zeros_like(problem.material_std)
+    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts.T * screen.registered
+    weighted = screen.weight * net
+    inside = jnp.sum(screen.own * weighted, axis=1)
+    of_left = jnp.sum(screen.own * screen.weight * screen.left, axis=1)
+    back = screen.inverse[:, 0] * inside[0] + screen.inverse[:, 1] * inside[1]
+    whole = jnp.sum(weighted * net)
+    return _Seen(
+        weighted=weighted,
+        inside=inside,
+        whole=whole,
+        information=whole - jnp.sum(back * inside),
+        score=jnp.sum(weighted * screen.left) - jnp.sum(back * of_left),
+    )
+
+
+def _value(problem: Problem, seen: _Seen, place: jax.Array) -> jax.Array:
+    deviation = place[2] - problem.height_m
+    prior = 0.5 * height_precision(problem.height_std_m) * jnp.square(deviation)
+    value = 0.5 * jnp.square(jnp.maximum(seen.score, 0.0)) / jnp.maximum(seen.information, 1e-30) - prior
+    # what walls hide all of, and what is as nothing beside rounding, explains no count
+    return jnp.where(jnp.isfinite(value) & (seen.information > ROUNDING * seen.whole), value, -prior)
 
 
 def screened(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> jax.Array:
     """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted."""
-    return looked_at(problem, screen, nuclide, place)[0]
+    return _value(problem, _seen(problem, screen, nuclide, place), place)
 
 
 def looked_at(
@@ -110,28 +153,15 @@ def looked_at(
 ) -> tuple[jax.Array, jax.Array]:  # fmt: skip
     """What `screened` finds with a source at ``place`` [3] in the place of that of the fit; and with one beside it.
 
-    The latter is the information [] (1/Bq^2) about its activity, that of the source of the fit unknown too.
+    The latter is the information [] (1/Bq^2) about its activity. The place and activity of the source of the fit are
+    unknown then, and the activities of the others.
     """
-    lengths = jnp.zeros_like(problem.material_std)
-    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts.T * screen.registered
-    weighted = screen.weight * net
-    inside = jnp.sum(screen.own * weighted, axis=1)  # [2, n]
-    of_left = jnp.sum(screen.own * screen.weight * screen.left, axis=1)
-    back = screen.inverse[:, 0] * inside[0] + screen.inverse[:, 1] * inside[1]
-    score = jnp.sum(weighted * screen.left) - jnp.sum(back * of_left)
-    whole = jnp.sum(weighted * net)
-    information = whole - jnp.sum(back * inside)
-    deviation = place[2] - problem.height_m
-    prior = 0.5 * height_precision(problem.height_std_m) * jnp.square(deviation)
-    value = 0.5 * jnp.square(jnp.maximum(score, 0.0)) / jnp.maximum(information, 1e-30) - prior
-    # what walls hide all of, and what is as nothing beside rounding, explains no count
-    value = jnp.where(jnp.isfinite(value) & (information > ROUNDING * whole), value, -prior)
-    both = jnp.sum(weighted * screen.there) - jnp.sum(screen.there_own * inside)
-    one = jnp.sum(screen.weight * jnp.square(screen.there)) - jnp.sum(
-        screen.there_own * jnp.sum(screen.own * screen.weight * screen.there, axis=1)
-    )
-    beside = information - jnp.square(both) / jnp.maximum(one, 1e-30)
-    return value, jnp.where(beside > ROUNDING * whole, beside, 0.0)
+    seen = _seen(problem, screen, nuclide, place)
+    both = jnp.einsum("rn,crn->c", seen.weighted, screen.there) - jnp.einsum(
+        "can,an->c", screen.there_own, seen.inside
+    )  # fmt: skip
+    beside = seen.information - both @ screen.there_inverse @ both
+    return _value(problem, seen, place), jnp.where(beside > ROUNDING * seen.whole, beside, 0.0)
 
 
 def spread(centre: jax.Array, reach_m: jax.Array, up_m: jax.Array, count: int, turn: jax.Array) -> jax.Array:

@@ -70,6 +70,7 @@ class _Progress:
     over: jax.Array  # [] bool
     left: jax.Array  # [] int32, seeks at most
     divisions: jax.Array  # [] int32, how often one may still be taken for two, or two be placed anew
+    made: jax.Array  # [K] bool, sources that the last division made
     closing: jax.Array  # [] bool, whether companions have been joined: no more sources are added
 
 
@@ -99,6 +100,7 @@ def find_sources(
     start = _Progress(
         state=first, again=first.sources.present, wide=~no, trial=no, before=first, over=no,
         left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max), divisions=jnp.int32(DIVISIONS), closing=no,
+        made=jnp.zeros_like(first.sources.present),
     )  # fmt: skip
 
     def step(p: _Progress) -> _Progress:
@@ -141,7 +143,7 @@ def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
         table = state.sources.nuclide_value.at[two.slot].set(state.sources.nuclide_value[two.number])
         state = replace(state, sources=replace(state.sources, nuclide_value=table))
         both = (numbers == two.number) | (numbers == two.slot)
-        after = replace(p, state=state, again=both, over=jnp.array(False), divisions=p.divisions - 1)
+        after = replace(p, state=state, again=both, made=both, over=jnp.array(False), divisions=p.divisions - 1)
         better = ratio > HOPELESS * params.further
         # what cannot be divided now cannot be later
         return jax.tree.map(partial(jnp.where, better), after, replace(p, divisions=jnp.int32(0)))
@@ -180,7 +182,7 @@ def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.
         less = replace(p, state=settled(problem, without(p.state, k)), before=p.state)
         least = params.further
         less = replace(less, trial=ratio[k] >= least, again=less.state.sources.present)
-        less = replace(less, divisions=_divisions(p, ratio[k] < least))
+        less = replace(less, divisions=_divisions(p, (jnp.arange(len(s.present)) == k) & (ratio[k] < least)))
         return jax.tree.map(partial(jnp.where, ratio[k] < TRIAL * least), less, p)
 
     return for_those(now, begin, lambda: p)
@@ -188,14 +190,15 @@ def _begun_trial(problem: Problem, params: SearchParams, p: _Progress, now: jax.
 
 def _ended_trial(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
     """``now``: the sources before the trial, unless those left explain the counts as well, within ``least`` []."""
+    gone = p.before.sources.present & ~p.state.sources.present
     needless = 2.0 * (p.before.likelihood - p.state.likelihood) < least
     kept = jax.tree.map(partial(jnp.where, now & ~needless), p.before, p.state)
-    return replace(p, state=kept, trial=p.trial & ~now, divisions=_divisions(p, now & needless))
+    return replace(p, state=kept, trial=p.trial & ~now, divisions=_divisions(p, now & needless & gone))
 
 
 def _divisions(p: _Progress, removed: jax.Array) -> jax.Array:
-    """How many more there may be: none once one that came of a division was ``removed`` [], for it would come again."""
-    return jnp.where(removed & (p.divisions < DIVISIONS), 0, p.divisions)
+    """How many more there may be: none once one that a division made is ``removed`` [K], for it would come again."""
+    return jnp.where(jnp.any(removed & p.made), 0, p.divisions)
 
 
 def _sought(

@@ -26,7 +26,7 @@ class Sources:
     towards: jax.Array  # [K, 3, 3] information about its place (`Settled.towards`)
     joined_m: jax.Array  # [K] how far off another one of its nuclide was that was taken away; 0: there was none
     beside_m: jax.Array  # [K] root of the second moment of it and such others about their mean, by activity
-    beside_bq: jax.Array  # [K] activity of such others
+    beside_bq: jax.Array  # [K] activity of such others that are too far off to be counted with it
 
 
 @pytree

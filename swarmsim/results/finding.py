@@ -2,7 +2,7 @@
 
 import math
 
-from swarmsim.estimation.pairs import COMPANION_M
+from swarmsim.estimation.pairs import COMPANION_M, ONE_M
 from swarmsim.results.record import Estimate, Spectrum
 from swarmsim.results.status import Verdict, in_mbq
 
@@ -38,26 +38,20 @@ def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool,
         return NOTHING_FOUND
     first = _surest(final[0], spectrum, no_way, by)
     if len(final) == 1:
-        return f"a source of {first}; {_beside(final)}"
+        return f"a source of {first}"
     others = "; ".join(f"of {_placed(one)}" for one in final[1:])
-    return f"{len(final)} sources: of {first}; {others}; {_beside(final)}"
-
-
-def _beside(final: tuple[Estimate, ...]) -> str:
-    """What another source beside each of those found would have to be to be noticed."""
-    limits = [
-        f"noticed from {in_mbq(one.beside_mbq)} on" if math.isfinite(one.beside_mbq) else "missed" for one in final
-    ]  # fmt: skip
-    whom = "it" if len(final) == 1 else "each"
-    return f"another one within {COMPANION_M:g} m of {whom} would be {', '.join(limits)}"
+    return f"{len(final)} sources: of {first}; {others}"
 
 
 def _placed(estimate: Estimate) -> str:
     x, y = estimate.position_m[:2]
     placed = f"{in_mbq(estimate.activity_mbq)} {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
-    if estimate.joined_m <= 0.0:
-        return placed
-    return f"{placed} (or several within {math.ceil(estimate.joined_m)} m, or behind other walls than presumed)"
+    if estimate.joined_m > 0.0:
+        return f"{placed} (or several within {math.ceil(estimate.joined_m)} m, or behind other walls than presumed)"
+    another = f"another {estimate.nuclide} source {ONE_M:g} to {COMPANION_M:g} m off"
+    if not math.isfinite(estimate.beside_mbq):
+        return f"{placed} ({another} may go unnoticed whatever its activity)"
+    return f"{placed} ({another} would be noticed from {in_mbq(estimate.beside_mbq)} on)"
 
 
 def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str) -> str:

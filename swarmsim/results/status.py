@@ -233,26 +233,34 @@ def _unexplained(chart: RadiationMap, final: Sequence[Estimate], background_std:
 def _disagreement(
     before: Estimate, survey: Sequence[Estimate], sources: Sequence[Estimate]
 ) -> list[tuple[Status, str]]:
-    """Between a source of the survey and the nearest of the same nuclide by all counts, each with those beside it."""
+    """Between a source of the survey and the nearest of the same nuclide by all counts.
+
+    Each by itself or with those beside it: the survey tells sources beside one another apart no better than it can, and
+    of two at the limit of what is beside one another either may have them apart.
+    """
     alike = [one for one in sources if one.nuclide == before.nuclide]
     if not alike:
         return []
     final = min(alike, key=lambda one: _apart_m(one, before))
-    # the survey tells sources beside one another apart no better than it can
     first, last = _beside(before, survey), _beside(final, sources)
+    said = [_contradiction(a, b) for a, b in itertools.product(([before], first), ([final], last))]
+    return [("inconsistent", said[-1])] if said[-1] and all(said) else []
+
+
+def _contradiction(first: Sequence[Estimate], last: Sequence[Estimate]) -> str:
+    """What sources by the survey and by all counts do not agree in; nothing if they do."""
     (begun, of_first), (ended, of_last) = _centre(first), _centre(last)
     apart, covariance = ended - begun, of_first + of_last + MODEL_STD_M**2 * np.eye(2)
     if float(apart @ np.linalg.solve(covariance, apart)) > APART_SIGMA**2:
         distance = float(np.linalg.norm(apart))
-        text = f"the {final.nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
-        return [("inconsistent", text)]
+        return f"the {last[0].nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
     totals = [sum(max(one.activity_mbq, 1e-9) for one in group) for group in (first, last)]
     stds = [max(one.activity_std_mbq for one in group) for group in (first, last)]
     ratio = np.log(totals[1] / totals[0])
     if abs(ratio) > APART_SIGMA * np.hypot(np.hypot(stds[0] / totals[0], stds[1] / totals[1]), MODEL_STD_LOG):
-        text = f"the activity of the {final.nuclide} source by the survey and by all counts differs "
-        return [("inconsistent", f"{text}{np.exp(abs(ratio)):.3g} times")]
-    return []
+        text = f"the activity of the {last[0].nuclide} source by the survey and by all counts differs "
+        return f"{text}{np.exp(abs(ratio)):.3g} times"
+    return ""
 
 
 def _apart_m(one: Estimate, other: Estimate) -> float:

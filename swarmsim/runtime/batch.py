@@ -21,6 +21,7 @@ from swarmsim.runtime.programs import Program, prepare
 from swarmsim.scalars import Layout
 
 SMALL = 4096  # elements up to which an array carries the mission axis whether or not missions differ in it
+FEW = 3  # missions that are computed by the program of one: too few to be spread over devices
 MANY_VEHICLES = 1024  # of all missions on a device
 TOGETHER = IN_STEP  # missions that an accelerator estimates in step; a processor core takes one, which fits its cache
 
@@ -58,8 +59,9 @@ class Batch:
         idle = on_processor() and self._mesh is None and len(jax.devices()) > 1
         self._cores = Mesh(np.array(jax.devices()), ("core",)) if idle else None
         self._programs: dict[Any, Program] = {}
-        # What a processor computes mission by mission is one program for any number of them.
-        self._one = Batch(1, clock) if _together() == 1 and self._mesh is None and missions > 1 else None
+        # What a processor computes mission by mission is one program for one or a few of them.
+        few = self._mesh is None and 1 < missions <= FEW
+        self._one = Batch(1, clock) if few and _together() == 1 else None
 
     def spread(self, trees: Sequence[Any]) -> "Spread":
         """Arguments of B missions on the devices, from one tree for each mission, or one tree for all.
@@ -125,7 +127,7 @@ class Batch:
             each mission; the rest of their rows are zero.
         """
         if self._one is not None and (in_turn or only is not None):
-            made = self._one_by_one(name, function, inputs, carried, common, only, shared)
+            made = self._one_by_one(name, function, inputs, carried, common, only, donate, shared)
             if donate:
                 jax.tree.map(lambda leaf: leaf.delete(), carried)
             return made
@@ -144,6 +146,7 @@ class Batch:
         carried: Any,
         common: Sequence[Any],
         only: Any,
+        donate: bool,
         shared: bool,
     ) -> Any:
         """`run` by the program of one mission; a mission that is not asked for keeps what it carries."""
@@ -155,11 +158,11 @@ class Batch:
         made: list[np.ndarray] = [] if only is None else [leaf.copy() for leaf in leaves]
         for mission in asked:
             rows = slice(mission, mission + 1)
-            own = jax.tree.unflatten(structure, [one.put(leaf[rows]) for leaf in leaves])
+            own = jax.tree.unflatten(structure, [one.put(leaf[rows].copy()) for leaf in leaves])
             chosen = None if only is None else one.put(np.ones(1, bool))
             result = one.run(
                 name, function, [spread.rows(one, rows) for spread in inputs], own, common,
-                only=chosen, in_turn=only is None, shared=shared,
+                only=chosen, in_turn=only is None, donate=donate, shared=shared,
             )  # fmt: skip
             found, structure_ = jax.tree.flatten(result)
             made = made or [np.zeros((self.missions, *leaf.shape[1:]), leaf.dtype) for leaf in found]
@@ -179,7 +182,7 @@ class Batch:
             carried = jax.tree.map(lambda leaf: one.put(np.asarray(leaf)[first]), call["carried"])
             chosen = None if call.get("only") is None else one.put(np.ones(1, bool))
             spreads = [spread.rows(one, first) for spread in call["inputs"]]
-            alone = {"carried": carried, "inputs": spreads, "only": chosen, "donate": False}
+            alone = {"carried": carried, "inputs": spreads, "only": chosen}
             return one._prepared(call | alone)
         defaults = {"common": (), "only": None, "in_turn": False, "donate": False, "again": None, "shared": False}
         program, arguments = self._call(**(defaults | call))

@@ -127,14 +127,18 @@ def test_a_source_is_divided_where_two_others_beside_one_another_are_right():
 
 
 def test_one_source_strains_nothing_and_two_taken_for_one_do():
-    strains = []
+    strains, usuals = [], []
     for apart in (0.0, 4.0):
         truth = [(east(x), 0.5 * ACTIVITY) for x in (-0.5 * apart, 0.5 * apart)]
         found, usual = strain(*state_of(truth, [(AT, ACTIVITY)], seed=5))
         strains.append(float(found))
-        assert 0.0 < float(usual) < 1.41 * 360
+        usuals.append(float(usual))
     assert strains[0] < 30.0
     assert strains[1] > 2.0 * float(PARAMS.search.further)
+    # errors from the prior would have 1.40 for each window whose rate is known well; 60 of the rover's are
+    assert all(1.3 * 60 < usual < 1.41 * 120 for usual in usuals)
+    # of no source no window tells
+    assert float(strain(*state_of([(AT, 1.0)]))[1]) < 0.1
 
 
 def columns_of(truth):
@@ -187,9 +191,10 @@ def test_what_is_known_of_another_source_beside_one_is_the_information_about_bot
     slopes = columns_of([(AT, 200e6), (east(apart), 4e6)])[1]
     mean = np.asarray(mean_rois(SITE, DETECTORS, BOTH, [(AT, 200e6, "Co-60")]), float)
     weight = np.asarray(problem.trust) / np.maximum(mean, 1e-9)
-    one, other = slopes[3], slopes[7] / 4e6
-    products = [np.sum(a * b * weight) for a, b in ((other, other), (one, other), (one, one))]
-    expected = products[0] - products[1] ** 2 / products[2]
+    columns = np.concatenate([slopes[:4], slopes[7:] / 4e6])  # place and log activity of the one, activity of the other
+    information = np.einsum("anr,bnr,nr->ab", columns, columns, weight)
+    information[2, 2] += 1.0 / float(problem.height_std_m) ** 2
+    expected = information[4, 4] - information[4, :4] @ np.linalg.solve(information[:4, :4], information[:4, 4])
     rest = without(state, jnp.int32(0)).added
     best = as_known(problem, state, jnp.int32(0), jnp.array(False)).fit
     screen = screen_of(problem, rest, best.rates, position_of(SITE, state.sources.place[0]), best.unknowns)
@@ -211,14 +216,17 @@ def test_what_is_sought_again_does_not_go_where_it_explains_less(monkeypatch):
 
 
 def test_what_a_division_made_and_a_trial_refuted_is_not_made_again():
-    _, state = state_of([(AT, ACTIVITY)])
+    _, two = state_of([(AT, ACTIVITY), (east(4.0), ACTIVITY)])
+    one = without(two, jnp.int32(1))
     begun = sources._Progress(
-        state=state, again=jnp.array([False]), wide=jnp.array(False), trial=jnp.array(True), before=state,
-        over=jnp.array(False), left=jnp.int32(9), divisions=jnp.int32(sources.DIVISIONS - 1), closing=jnp.array(False),
+        state=one, again=jnp.zeros(2, bool), wide=jnp.array(False), trial=jnp.array(True), before=two,
+        over=jnp.array(False), left=jnp.int32(9), divisions=jnp.int32(3), made=jnp.ones(2, bool),
+        closing=jnp.array(False),
     )  # fmt: skip
-    worse = replace(begun, before=replace(state, likelihood=state.likelihood + 1000.0))
-    least = PARAMS.search.further
-    assert int(sources._ended_trial(least, begun, jnp.array(True)).divisions) == 0
-    assert int(sources._ended_trial(least, worse, jnp.array(True)).divisions) == sources.DIVISIONS - 1
-    untouched = replace(begun, divisions=jnp.int32(sources.DIVISIONS))
-    assert int(sources._ended_trial(least, untouched, jnp.array(True)).divisions) == sources.DIVISIONS
+    least, now = PARAMS.search.further, jnp.array(True)
+    assert int(sources._ended_trial(least, begun, now).divisions) == 0
+    # where the trial shows that it is needed, or another one was left out, there may be more
+    needed = replace(begun, before=replace(two, likelihood=two.likelihood + 1000.0))
+    assert int(sources._ended_trial(least, needed, now).divisions) == 3
+    elsewhere = replace(begun, made=jnp.array([True, False]))
+    assert int(sources._ended_trial(least, elsewhere, now).divisions) == 3

@@ -66,9 +66,9 @@ def test_pairs_are_counted_by_what_was_told_of_them():
     # 50 of 80 MBq: noticed in two of the answers; that without a source is no answer about one beside it
     assert rows[0]["beside_mbq"] == 80.0
     assert rows[3]["beside_mbq"] is None
-    assert pairs.summarised(rows)["by_limit"]["0.5 to 1"] == {"sources": 3, "noticed": 2}
+    assert pairs.summarised(rows)["by_limit"]["0.5 to 1"] == {"sources": 3, "told": 2, "doubted": 0}
     never = [pairs.row_of(drawn, record([], [with_joined(estimate(0.0), 0.0, np.inf)], "ambiguous"))]
-    assert pairs.summarised(never)["by_limit"]["0 to 0.25"] == {"sources": 1, "noticed": 1}
+    assert pairs.summarised(never)["by_limit"]["0 to 0.25"] == {"sources": 1, "told": 0, "doubted": 1}
 
 
 def test_no_pairs_at_all_are_refused(tmp_path, capsys):

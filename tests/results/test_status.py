@@ -64,6 +64,9 @@ def test_the_survey_is_compared_with_all_sources_beside_one_another() -> None:
     assert (
         verdict(aerial=(estimate(0.5, activity=165.0), estimate(10.5, activity=62.0)), final=final).status == "located"
     )
+    # either may have two apart that the other takes for beside one another
+    wide, near = (estimate(), estimate(12.4)), (estimate(), estimate(11.0))
+    assert verdict(aerial=near, final=wide).status == verdict(aerial=wide, final=near).status == "located"
     # a contradiction of the two is told once
     moved = verdict(aerial=(estimate(9.0, std=1.0), estimate(19.0, std=1.0)), final=(estimate(), estimate(10.0)))
     assert moved.reasons == ("the Co-60 source by the survey and by all counts lies 9 m apart",)

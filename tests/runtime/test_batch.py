@@ -92,16 +92,18 @@ def test_cores_that_missions_leave_idle_share_what_each_computes(missions, count
         assert len(a.sharding.device_set) == 1
 
 
-@pytest.mark.parametrize("shared", [False, True])
-def test_what_is_done_mission_by_mission_is_one_program_for_any_number_of_them(shared):
+@pytest.mark.parametrize("how", ["in turn", "shared", "some"])
+def test_what_is_done_mission_by_mission_is_one_program_for_a_few_of_them(how):
     for count in (1, 2, 3):
         clock = Clock()
         missions = Batch(count, clock)
         inputs = missions.spread([of_mission(scale) for scale in range(1, count + 1)])
-        call = {"name": f"any number {shared}", "function": grown, "inputs": [inputs], "common": (np.float32(0.5),)}
-        call |= {"carried": missions.put(10.0 ** np.arange(count, dtype=np.float32)), "shared": shared}
-        missions.prepare([call | {"in_turn": True}])
-        result = missions.run(**call, in_turn=True)
+        call = {"name": f"any number {how}", "function": grown, "inputs": [inputs], "common": (np.float32(0.5),)}
+        call |= {"carried": missions.put(10.0 ** np.arange(count, dtype=np.float32)), "shared": how == "shared"}
+        asked = missions.put(np.ones(count, bool))
+        call |= {"only": asked, "donate": True} if how == "some" else {"in_turn": True}
+        missions.prepare([call])
+        result = missions.run(**call)
         np.testing.assert_array_equal(result, [alone(1.0 + k, 10.0**k) for k in range(count)])
         assert count == 1 or not clock.compiled
 
@@ -134,13 +136,13 @@ def test_results_without_a_size_are_kept(together, monkeypatch):
 
 
 @pytest.mark.parametrize("together", [1, 2, 3, 8])
-@pytest.mark.parametrize("asked", ["100100", "000000", "111111", "011101"])
+@pytest.mark.parametrize("asked", ["100100", "000000", "111111", "011101", "101", "000", "010"])
 def test_only_the_missions_that_are_asked_for_change(asked, together, monkeypatch):
     """Whatever group they fall into; groups are filled with those that are asked for."""
     monkeypatch.setattr(batch, "_together", lambda: together)
-    missions = Batch(6, Clock())
+    missions = Batch(len(asked), Clock())
     inputs = missions.spread([of_mission(1.0)])
-    values = np.arange(10.0, 70.0, 10.0, dtype=np.float32)
+    values = 10.0 * np.arange(1.0, len(asked) + 1.0, dtype=np.float32)
     chosen = np.array([c == "1" for c in asked])
     name = f"some {together}"
     result = missions.run(name, grown, [inputs], missions.put(values), (np.float32(0.5),), only=missions.put(chosen))
