@@ -158,7 +158,7 @@ def test_a_weak_source_far_from_others_of_its_nuclide_is_believed() -> None:
     assert verdict(final=(estimate(), replace(weak, nuclide="Cs-137"))).status == "located"
     assert verdict(final=(estimate(), replace(weak, detection=300.0))).status == "located"
     assert verdict(final=(estimate(), replace(weak, position_m=np.array([27.0, 0.0, 1.0])))).status == "located"
-    assert verdict(fit=replace(GOOD, strain=100.0)).status == "located"
+    assert verdict(fit=replace(GOOD, strain=300.0)).status == "located"
 
 
 def test_a_counter_is_saturated_short_of_its_highest_rate() -> None:
