@@ -203,10 +203,12 @@ def test_useless_data_give_a_finite_answer_that_is_no_detection(localiser, case)
         "no counts": counted(AERIAL, jnp.zeros_like(background)),
         "outside": drawn(far, background, 1),
     }[case]
-    estimated = localiser(m)
-    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(estimated.fits))
-    assert not np.any(estimated.fits.present)
-    assert np.all(np.abs(np.asarray(estimated.fits.position_m)[:, :2]) <= 90.0)
+    fits = localiser(m).fits
+    # beside none that was found no other one is thought of
+    assert np.all(np.isposinf(fits.beside_bq))
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(replace(fits, beside_bq=fits.joined_m)))
+    assert not np.any(fits.present)
+    assert np.all(np.abs(np.asarray(fits.position_m)[:, :2]) <= 90.0)
 
 
 def test_a_posterior_that_is_no_number_is_the_place_found_with_the_reach_of_the_search(localiser):
