@@ -64,7 +64,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     chart = None if conclusion is None else _map(simulation, conclusion.survey)
     verdict = None
     if conclusion is not None and chart is not None:
-        verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final)
+        verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, spectrum)
     return MissionRecord(
         name=simulation.scenario.mission.name,
         site=simulation.site_model.name,
@@ -310,6 +310,7 @@ def _verdict(
     conclusion: Any,
     aerial: tuple[Estimate, ...],
     final: tuple[Estimate, ...],
+    spectrum: Spectrum | None,
 ) -> Verdict:
     """Status of the mission's answer."""
     estimated, detectors, presumed = conclusion.estimated, simulation.plan.detectors, simulation.plan.presumed
@@ -336,6 +337,7 @@ def _verdict(
         float(presumed.background_std),
         (float(np.exp(presumed.log_activity)) * 1e-6, float(presumed.log_activity_std)),
         gamma_constants(simulation, final),
+        {} if spectrum is None else spectrum.scores,
     )
 
 

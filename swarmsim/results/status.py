@@ -40,6 +40,7 @@ STRAINED = 350.0
 Of 300 missions, good answers had up to 200, but for one of 400 in a barn; wrong ones in barns and two sources in the
 place of one 400 to 1300.
 """
+CONFIRMED = 0.9  # probability in the spectrum taken near it, above which a nuclide of several in one place is believed
 IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
@@ -76,6 +77,7 @@ def assess(
     background_std: float,
     activity: tuple[float, float],
     at_1_m: Mapping[str, GammaConstant] = MappingProxyType({}),
+    identified: Mapping[str, float] = MappingProxyType({}),
 ) -> Verdict:
     """Judge an answer.
 
@@ -90,6 +92,7 @@ def assess(
         background_std: how much a background may differ from place to place, of its logarithm.
         activity: what is presumed of a source's, in MBq, and the standard deviation of its logarithm.
         at_1_m: dose rates of the nuclides that were found, by which the strength of different ones is compared.
+        identified: probability of each nuclide in the spectrum taken near the surest source.
     """
     covered = coverage(samples, chart, ground_m)
     reasons = []
@@ -101,7 +104,7 @@ def assess(
         status = "incomplete_survey" if status in ("none", "located") else status
         reasons.append(f"only {covered:.0%} of the survey area was measured")
     strength = [one.activity_mbq * at_1_m[one.nuclide].kerma_ugy_h if at_1_m else one.activity_mbq for one in final]
-    doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity)
+    doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity) + _mixed(final, identified)
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     reasons += [sentence for _, sentence in doubts]
@@ -198,6 +201,19 @@ def _companions(final: Sequence[Estimate], strength: Sequence[float]) -> list[tu
             other = "a stronger one" if share < 1.0 else "another one"
             text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
             found.append(("ambiguous", f"{text} may be an error of the model"))
+    return found
+
+
+def _mixed(final: Sequence[Estimate], identified: Mapping[str, float]) -> list[tuple[Status, str]]:
+    """Different nuclides in one place: few energy windows tell two of them from a third one, which a spectrum does."""
+    found: list[tuple[Status, str]] = []
+    for one, other in itertools.combinations(final, 2):
+        apart, names = _apart_m(one, other), (one.nuclide, other.nuclide)
+        # the first is the surest one
+        shown = one is final[0] and all(identified.get(name, 0.0) > CONFIRMED for name in names)
+        if names[0] != names[1] and apart < ONE_M and not shown:
+            text = f"the {names[0]} and {names[1]} sources {apart:.2g} m apart may be one of another nuclide"
+            found.append(("ambiguous", text))
     return found
 
 

@@ -40,7 +40,7 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
 
 def verdict(
     samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0,
-    at_1_m=MappingProxyType({}), presumed=(100.0, 10.0),
+    at_1_m=MappingProxyType({}), presumed=(100.0, 10.0), identified=MappingProxyType({}),
 ):  # fmt: skip
     samples = survey() if samples is None else samples
     n = len(samples.counts)
@@ -48,7 +48,7 @@ def verdict(
     return assess(
         samples, chart(hotspots, rate), limits, np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
-        (presumed[0], float(np.log(presumed[1]))), at_1_m,
+        (presumed[0], float(np.log(presumed[1]))), at_1_m, identified,
     )  # fmt: skip
 
 
@@ -85,6 +85,19 @@ def test_different_nuclides_are_compared_by_what_they_add() -> None:
     even = {"Co-60": GammaConstant(0.35, 0.30), "Am-241": GammaConstant(0.003, 0.0025)}
     pair = (estimate(activity=5.0), estimate(20.0, activity=600.0, nuclide="Am-241"))
     assert verdict(final=pair, at_1_m=even, aerial=(estimate(1.0, activity=5.0),)).status == "located"
+
+
+def test_two_nuclides_in_one_place_are_believed_where_the_spectrum_shows_both() -> None:
+    pair = (estimate(), estimate(0.4, activity=200.0, nuclide="Cs-137"))
+    doubtful = verdict(final=pair)
+    assert doubtful.status == "ambiguous"
+    assert doubtful.reasons == ("the Co-60 and Cs-137 sources 0.4 m apart may be one of another nuclide",)
+    assert verdict(final=pair, identified={"Co-60": 0.99, "Cs-137": 0.95}).status == "located"
+    assert verdict(final=pair, identified={"Co-60": 0.99, "Cs-137": 0.05}).status == "ambiguous"
+    # the spectrum is of the surest source
+    third = replace(estimate(), position_m=np.array([0.0, 40.0, 1.0]))
+    assert verdict(final=(third, *pair), identified={"Co-60": 0.99, "Cs-137": 0.95}).status == "ambiguous"
+    assert verdict(final=(estimate(), estimate(4.0, activity=200.0, nuclide="Cs-137"))).status == "located"
 
 
 def test_a_good_answer_has_no_reasons() -> None:
@@ -174,7 +187,7 @@ def test_a_source_that_the_survey_did_not_show_is_compared_with_none() -> None:
     "other",
     [
         {"x": 4.0, "activity": 90.0},
-        {"x": 0.3, "nuclide": "I-131"},
+        {"x": 3.2, "nuclide": "I-131"},
         {"x": 15.0, "activity": 20.0},
         {"x": 6.0, "activity": 90.0},
         {"x": 6.0, "activity": 20.0, "nuclide": "I-131"},
