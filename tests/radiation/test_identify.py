@@ -4,19 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.special import xlogy
-from scipy.stats import kstest
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.load import load_named
 from swarmsim.radiation import Detector, Identification, Library, build_detector, identify, spectrum_rate
 from swarmsim.radiation.detector import AIR
-from swarmsim.radiation.goodness import p_value
 from swarmsim.radiation.identify import NONE, UNKNOWN, _present
-from swarmsim.radiation.laplace import COLUMNS, NATURAL, NATURAL_STD, Data, Hypothesis, laplace, swept
-from swarmsim.radiation.lines import GAINS, ORDERS, identification_bins, orders
+from swarmsim.radiation.laplace import COLUMNS, Data, Hypothesis, laplace
+from swarmsim.radiation.lines import ORDERS
 from swarmsim.radiation.rate import end_on, mean_view
-from swarmsim.radiation.response import build_response
 from swarmsim.radiation.templates import shielded, thickness_m
 from tests.radiation.points import MOUNT, point, through
 
@@ -350,85 +346,6 @@ def test_random_mixtures_are_named(detectors: Detectors) -> None:
     assert np.mean(np.all(named >= chosen, axis=1)) > 0.85
     assert np.mean(np.any(named & ~chosen, axis=1)) < 0.1
     assert np.mean(np.asarray(found.unknown) > 0.5) < 0.1
-
-
-def test_goodness_is_a_p_value() -> None:
-    """Uniform over counts of the expectation, whether few or many are expected, and small for others."""
-    rng = np.random.default_rng(8)
-    for scale in (0.2, 3.0, 100.0):
-        expected = jnp.asarray(scale * rng.uniform(0.2, 2.0, 170), jnp.float32)
-        counts = rng.poisson(np.asarray(expected), (400, 170)).astype(np.float32)
-        values = jax.vmap(lambda row, e=expected: p_value(row, e, jnp.ones(170), 0.0))(counts)
-        assert kstest(np.asarray(values), "uniform").pvalue > 0.01
-    assert float(p_value(jnp.asarray(counts[0]), expected * 1.3, jnp.ones(170), 0.0)) < 1e-4
-
-
-def test_goodness_allows_for_the_error_of_the_model() -> None:
-    """Uniform where the expectation is off by that error in each bin, which the counts show."""
-    rng = np.random.default_rng(9)
-    mean = rng.uniform(200.0, 1000.0, 170)
-    counts = rng.poisson(mean * np.maximum(1.0 + 0.03 * rng.standard_normal((400, 170)), 0.0)).astype(np.float32)
-    expected = jnp.asarray(mean, jnp.float32)
-    values = jax.vmap(lambda row: p_value(row, expected, jnp.ones(170), 0.0, 0.03))(counts)
-    assert kstest(np.asarray(values), "uniform").pvalue > 0.01
-    assert np.median(jax.vmap(lambda row: p_value(row, expected, jnp.ones(170), 0.0))(counts)) < 0.01
-
-
-def test_gain_moves_and_width_widens_peaks(library: Library) -> None:
-    """A Gaussian peak keeps its counts, moves with the gain, and has the variance of the new width."""
-    spec = load_named("detectors", "nai_2x2")
-    response = build_response(spec, library.material(spec.crystal), library.material(spec.housing.material))
-    channel, bins = np.arange(1024), np.asarray(identification_bins(response))
-    sigma = float(response.sigma_kev(np.asarray(response.channel_centre_kev[341]))) / response.channel_width_kev
-    peak = np.exp(-0.5 * ((channel - 341) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-    table, middle = orders(response, peak), 0.5 * (bins[1:] + bins[:-1])
-    for width in (0.87, 1.13):
-        t = 0.5 * (width**2 - 1.0)
-        wide = table[GAINS.index(1.0)].T @ np.array([1.0, 0.0, 0.0, t, t * t])
-        assert wide.sum() == pytest.approx(1.0, abs=0.01)
-        of_bins = np.sum((bins[1:] - bins[:-1]) ** 2 * wide) / 12.0  # within bins
-        assert np.sum(wide * (middle - 341.5) ** 2) == pytest.approx((width * sigma) ** 2 + of_bins, rel=0.05)
-    for gain in (0.9775, 1.0, 1.02):
-        k = int(np.argmin(np.abs(np.asarray(GAINS) - gain)))
-        u = gain - GAINS[k]
-        moved = table[k].T @ np.array([1.0, u, u * u, 0.0, 0.0])
-        assert np.sum(moved * middle) / moved.sum() == pytest.approx(gain * 341.5, rel=1e-3)
-
-
-def test_evidence_of_a_flat_background_is_the_integral() -> None:
-    """Laplace's method against the sum over a grid of the one parameter that the data tell, and of a strength."""
-    bins, rng = 40, np.random.default_rng(3)
-    natural = np.full(bins, 10.0)
-    peak = np.exp(-0.5 * ((np.arange(bins) - 20.0) / 2.0) ** 2)
-    peak /= peak.sum()
-    counts = rng.poisson(natural + 60.0 * peak).astype(np.float64)
-    column = np.zeros((COLUMNS, ORDERS, bins), np.float32)
-    column[0, 0], column[NATURAL, 0] = natural / natural.sum(), peak
-    scale = np.zeros(COLUMNS, np.float32)
-    scale[[0, NATURAL]] = NATURAL_STD * natural.sum(), 50.0
-    strength = np.zeros(COLUMNS, np.float32)
-    strength[NATURAL] = 1.0
-    start = np.zeros(COLUMNS, np.float32)
-    start[[0, NATURAL]] = natural.sum(), 30.0
-    hypothesis = Hypothesis(*map(jnp.asarray, (column, scale, strength, start)), jnp.float32(1.0))
-    data = Data(*map(jnp.asarray, (counts, np.ones(bins), natural.sum(), 120.0)))
-    found = laplace(hypothesis, data)
-    level = natural.sum() * (1.0 + NATURAL_STD * np.linspace(-2.0, 2.0, 401))
-    s = np.linspace(0.0, 300.0, 601)
-    mean = level[:, None, None] * column[0, 0] + s[:, None] * column[NATURAL, 0]
-    log_likelihood = np.sum(xlogy(counts, mean) - mean - (xlogy(counts, counts) - counts), axis=-1)
-    x = (level / natural.sum() - 1.0) / NATURAL_STD
-    prior = np.exp(-0.5 * x**2)[:, None] / np.sqrt(2 * np.pi) * 2.0 / (np.pi * 120.0 * (1.0 + (s / 120.0) ** 2))
-    truth = np.log(np.sum(np.exp(log_likelihood) * prior) * (x[1] - x[0]) * (s[1] - s[0]))
-    assert float(found.score) == pytest.approx(truth, abs=0.1)
-
-
-def test_the_sweep_inverts_a_matrix() -> None:
-    a = np.random.default_rng(5).normal(size=(10, 14))
-    matrix = a @ a.T + np.eye(10)
-    inverse, log_determinant = swept(jnp.asarray(matrix, jnp.float32))
-    np.testing.assert_allclose(inverse, np.linalg.inv(matrix), atol=1e-5)
-    assert float(log_determinant) == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-4)
 
 
 def test_thickness_gives_its_optical_depth(detectors: Detectors) -> None:
