@@ -195,7 +195,7 @@ class Flight:
         """Offer the policy's setpoint, or end the vehicle's part where the mission is done with it."""
         control = self.control
         if self._flown_by_hand(step, t):
-            self._waits = False  # handed back between phases it has to hold anew
+            self._waits = False
             return None if self.helm is None else self.helm.setpoint
         if not step.in_phase:
             if not self._waits:
@@ -236,6 +236,7 @@ class Flight:
             return True
         if flown_m is not None:
             self.live.join(self._body(t), flown_m)
+            self._waits = False  # handed back between phases it has to hold anew, however short it was flown by hand
             if self.helm.resume():
                 self._stage("mission")
         elif self.helm.flies and self.helm.setpoint is not None:

@@ -258,20 +258,36 @@ def test_a_link_that_breaks_while_a_pilot_flies_is_told(uav):
         flown(uav, script)
 
 
-def test_handed_back_between_phases_it_holds_again(uav, monkeypatch):
+@pytest.mark.parametrize("within_a_period", [False, True])
+def test_handed_back_between_phases_it_holds_again(uav, monkeypatch, within_a_period):
+    goes_on, stands = threading.Event(), threading.Event()
+    goes_on.set()
+
+    def waiting(*a):
+        stands.set()
+        goes_on.wait(10.0)
+        return replace(step(*a), in_phase=False, begins=(), over=False)
+
     def script(flight, pilot, link):
-        step = uav.step
-        monkeypatch.setattr(uav, "step", lambda *a: replace(step(*a), in_phase=False, begins=(), over=False))
+        monkeypatch.setattr(uav, "step", waiting)
         monkeypatch.setattr(uav, "has_phase_to_come", lambda: True)
         begun(flight)
         until(lambda: flight._waits)
+        if within_a_period:  # the mission sees nothing of the pilot's flight but its end
+            goes_on.clear()
+            stands.clear()
+            until(stands.is_set)
+        flight.helm.setpoint = None
         pilot.ask(Event.TAKE_OVER)
         until(lambda: flight.helm.setpoint is not None)
         pilot.ask(Event.TAKE_OVER)
+        until(lambda: flight.helm.handed_back() is not None or not flight.helm.flies)
+        goes_on.set()
         until(lambda: not flight.helm.flies)
         time.sleep(3.0 * QUICK.watchdogs.stale_s)
         assert flight.control.alarm is None
         monkeypatch.setattr(uav, "has_phase_to_come", lambda: False)
 
+    step = uav.step
     flight, _ = flown(uav, script)
     assert flight.log.ended == ""
