@@ -1,12 +1,16 @@
-"""What missions tell of two sources of one nuclide beside one another.
+"""What missions tell of two sources beside one another, of one nuclide or of two.
 
     python -m experiments.validation.pairs --missions 64 --out out/pairs
+    python -m experiments.validation.pairs --mixed --missions 64 --out out/mixed
 
 Two sources on the site of ``recon``, 1 to 14 m apart, 20 to 400 MBq each, in no solid obstacle but in buildings too.
+With ``--mixed`` they are of different nuclides, and a third of them in one place.
+
 Writes ``pairs.csv`` (a row for each mission) and ``summary.json``: by distance, how many are told as two, as one that
 may be several, or as one; how many of those answers that say that they are sure have both sources in the 95 % region of
-a place that they tell. And of the weaker sources 3 to 12 m from the stronger, by their activity over the one from which
-on the answer says that it would have noticed them: how many it told, or told of one with a doubt of any kind.
+a place that they tell for their nuclide. And, of one nuclide, of the weaker sources 3 to 12 m from the stronger, by
+their activity over the one from which on the answer says that it would have noticed them: how many it told, or told of
+one with a doubt of any kind.
 """
 
 import argparse
@@ -26,6 +30,7 @@ from swarmsim.results.record import MissionRecord
 
 NUCLIDES = ("Co-60", "Cs-137", "Na-22", "I-131", "Eu-152")
 APART_M = (1.0, 2.0, 3.0, 6.0, 14.0)
+IN_ONE_PLACE = 1.0 / 3.0  # of the mixed ones
 ACTIVITY_MBQ = (20.0, 400.0)
 PLACE_M = ((-50.0, 50.0), (20.0, 40.0))  # x, and y to either side of the road in the middle of ``works_yard``
 HEIGHT_M = 1.0
@@ -38,6 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--missions", type=int, default=64)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--mixed", action="store_true", help="of two nuclides, also in one place")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
     options = parser.parse_args(arguments)
@@ -46,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rng = np.random.default_rng(options.seed)
     rows = []
     for number in range(options.missions):
-        drawn, simulation = _built(rng, options.set)
+        drawn, simulation = _built(rng, options.mixed, options.set)
         record = swarmsim.mission_record(simulation, simulation.rollout(options.seed + number), 0)
         rows.append(row_of(drawn, record))
         print(f"{number + 1} of {options.missions}: {json.dumps(rows[-1])}", flush=True)
@@ -60,10 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(json.dumps(summary))
 
 
-def _built(rng: np.random.Generator, settings: Sequence[str]) -> tuple[dict[str, Any], swarmsim.Simulation]:
+def _built(
+    rng: np.random.Generator, mixed: bool, settings: Sequence[str]
+) -> tuple[dict[str, Any], swarmsim.Simulation]:
     """A pair that is drawn, and the simulation with it; another one where a source would lie in a solid obstacle."""
     for _ in range(TRIES):
-        drawn = _drawn(rng)
+        drawn = _drawn(rng, mixed)
         own = ["engine=analytic", "knowledge.nuclides=unknown", f"sources={_sources(drawn)}", *settings]
         scenario = swarmsim.load("recon", own)
         try:
@@ -73,12 +81,16 @@ def _built(rng: np.random.Generator, settings: Sequence[str]) -> tuple[dict[str,
     raise RuntimeError(f"of {TRIES} pairs each lies in an obstacle")
 
 
-def _drawn(rng: np.random.Generator) -> dict[str, Any]:
-    """Nuclide, places [2, 2] and activities [2] of a pair."""
+def _drawn(rng: np.random.Generator, mixed: bool) -> dict[str, Any]:
+    """Nuclides [2], places [2, 2] and activities [2] of a pair."""
     apart, turn = np.exp(rng.uniform(*np.log([APART_M[0], APART_M[-1]]))), rng.uniform(0.0, 2.0 * np.pi)
     first = np.array([rng.uniform(*PLACE_M[0]), rng.choice([-1.0, 1.0]) * rng.uniform(*PLACE_M[1])])
+    nuclides = [str(rng.choice(NUCLIDES))] * 2
+    if mixed:
+        nuclides = [str(name) for name in rng.choice(NUCLIDES, 2, replace=False)]
+        apart = 0.0 if rng.uniform() < IN_ONE_PLACE else apart
     return {
-        "nuclide": str(rng.choice(NUCLIDES)),
+        "nuclides": nuclides,
         "places": np.array([first, first + apart * np.array([np.cos(turn), np.sin(turn)])]),
         "mbq": np.exp(rng.uniform(*np.log(ACTIVITY_MBQ), 2)),
     }
@@ -86,20 +98,26 @@ def _drawn(rng: np.random.Generator) -> dict[str, Any]:
 
 def _sources(drawn: dict[str, Any]) -> str:
     one = "{{nuclide: {}, activity_mbq: {:.2f}, position_m: [{:.3f}, {:.3f}], height_m: {}}}"
-    parts = (one.format(drawn["nuclide"], a, *p, HEIGHT_M) for p, a in zip(drawn["places"], drawn["mbq"], strict=True))
-    return f"[{', '.join(parts)}]"
+    pair = zip(drawn["nuclides"], drawn["mbq"], drawn["places"], strict=True)
+    return f"[{', '.join(one.format(name, a, *p, HEIGHT_M) for name, a, p in pair)}]"
 
 
 def row_of(drawn: dict[str, Any], record: MissionRecord) -> dict[str, Any]:
-    """What a mission told of a pair; ``sigmas`` are how far both are from the next place, in standard deviations."""
-    sigmas = [min((_sigmas(place, one) for one in record.estimates), default=np.inf) for place in drawn["places"]]
+    """What a mission told of a pair; ``sigmas`` are how far both are from the next place, in standard deviations.
+
+    Of the places that are told for their nuclide.
+    """
+    sigmas = [
+        min((_sigmas(place, one) for one in record.estimates if one.nuclide == name), default=np.inf)
+        for name, place in zip(drawn["nuclides"], drawn["places"], strict=True)
+    ]
     if any(one.joined_m > 0.0 for one in record.estimates):
         told = "may be several"
     else:
         told = {0: "none", 1: "one", 2: "two"}.get(len(record.estimates), "more")
     return {
         "seed": record.seed,
-        "nuclide": drawn["nuclide"],
+        "nuclides": drawn["nuclides"],
         "apart_m": round(float(np.linalg.norm(drawn["places"][1] - drawn["places"][0])), 2),
         "mbq": [round(float(a), 1) for a in drawn["mbq"]],
         "status": record.status,
@@ -127,7 +145,7 @@ def _sigmas(place: np.ndarray, estimate: Any) -> float:
 def summarised(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The rows in numbers, by distance."""
     found = {}
-    for low, high in itertools.pairwise(APART_M):
+    for low, high in itertools.pairwise((0.0, *APART_M)):
         own = [row for row in rows if low <= row["apart_m"] < high]
         sure = [row for row in own if row["status"] == "located"]
         inside = [max(row["sigmas"]) < INSIDE_95 for row in sure]
@@ -137,7 +155,8 @@ def summarised(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
             "told": {told: sum(row["told"] == told for row in sure) for told in ("two", "may be several", "one")},
             "both_inside_95": sum(inside),
         }
-    return found | {"by_limit": _by_limit(rows)}
+    one_nuclide = [row for row in rows if len(set(row["nuclides"])) == 1]
+    return found | ({"by_limit": _by_limit(one_nuclide)} if one_nuclide else {})
 
 
 def _by_limit(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, int]]:

@@ -1,9 +1,13 @@
-"""Sources of one nuclide beside one another: one that is rather two, and two that are rather one.
+"""Sources beside one another: one that is rather two, two that are rather one, and two nuclides in one place.
 
 What a fit of one source has between two is hard to see afterwards: every window's rate has an error of the model of its
 own, and these take up what one source cannot explain, in the open at 4 m up to a factor of three. No further source has
 anything left to explain then. But errors of the model that are all of that size are themselves unlikely, and tell that
 something is wrong (`strain`); and two sources fitted together explain the counts without them (`divided`).
+
+What windows' rates depart from the model by is one factor for all that a window sees. A source that is sought beside
+one of another nuclide that stands at a wrong place follows it there, for then the same factors explain both: two
+nuclides in one place, of which the survey from the air knew the places to metres, are sought together (``mixed``).
 
 On the other hand what the model does not know of walls about a strong source looks like a weak one beside it. That is
 taken away, and what it said of place and activity counts as an error of the other (`joined`).
@@ -18,7 +22,7 @@ import jax.numpy as jnp
 from swarmsim.device import each, for_those, repeat_while
 from swarmsim.estimation.forward import Problem, rates, silent, variance_of, ways_from
 from swarmsim.estimation.normal_equations import Others, linearised, normal_equations
-from swarmsim.estimation.search import TOGETHER, Tried, attempt, bounds
+from swarmsim.estimation.search import GOLDEN_ANGLE_RAD, TOGETHER, Tried, attempt, bounds
 from swarmsim.estimation.state import Sources, State, ratios, settled, without
 from swarmsim.pytree import pytree
 
@@ -28,10 +32,16 @@ DIRECTIONS = 12
 AROUND_M = 1.0  # within which the places of both are changed together, in the first round
 CLOSER = 0.6  # the same in a further round, over that in the one before
 ROUNDS = 9
+FAR_MIXED_M = 8.0  # within which two of different nuclides are looked for in one place
+AROUND_MIXED_M = 2.0  # within which both are changed by the same, in the first round
+APART_MIXED = 0.5  # of that, within which the second is changed besides
+CLOSER_MIXED = 0.7
+ROUNDS_MIXED = 16
 PART = 18  # pairs of places that are tried in a step
-# fractional parts of multiples of these fill four dimensions evenly: powers of the root of x^5 = x + 1 (as in
-# `swarmsim.estimation.importance_sampling`)
+# fractional parts of multiples of these fill four and six dimensions evenly: powers of the roots of x^5 = x + 1 (as in
+# `swarmsim.estimation.importance_sampling`) and x^7 = x + 1
 _EVEN = (0.8566749, 0.7338919, 0.6287067, 0.5385972)
+_EVEN_MIXED = (0.8986537, 0.8075785, 0.7257334, 0.6521828, 0.5860865, 0.5266888)
 ONE_M = 3.0  # within it two sources of one nuclide are told as one
 COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
 COMPANION_RATIO = 0.15
@@ -47,7 +57,7 @@ class Two:
 
     number: jax.Array  # [] int32 of that one
     slot: jax.Array  # [] int32 of the second
-    offset_m: jax.Array  # [2, 2] of both from where the one was
+    offset_m: jax.Array  # [2, 3] of both from where the one was
     place: jax.Array  # [3] of the first
     first: Others  # what it adds [n, R], [n]
     second: Tried
@@ -72,22 +82,31 @@ def strain(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
 
 def divisible(s: Sources) -> jax.Array:
     """Whether [] there is room for one more, or two that may be placed anew."""
-    return jnp.any(s.present) & (~jnp.all(s.present) | _nearest(s)[2])
+    return jnp.any(s.present) & (~jnp.all(s.present) | _nearest(s, jnp.array(False))[2])
 
 
-def divided(problem: Problem, state: State) -> tuple[Two, State, jax.Array]:
+def are_mixed(s: Sources) -> jax.Array:
+    """Whether [] two of different nuclides are companions."""
+    return _nearest(s, jnp.array(True))[2]
+
+
+def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, State, jax.Array]:
     """Two sources in the place of one; the two nearest to one another, if they are companions, are placed anew.
+
+    With ``mixed`` [] only the two nearest of different nuclides are: in one place first, then apart.
 
     Returns:
         the two, the state with the first of them, and twice the logarithm of the likelihood ratio [] over ``state``.
     """
     s = state.sources
-    stronger, weaker, beside = _nearest(s)
+    stronger, weaker, beside = _nearest(s, mixed)
     numbers, full = jnp.arange(s.present.shape[0]), jnp.all(s.present)
     pair = without(state, weaker)
     starts = _offsets()
-    here = jnp.stack([jnp.zeros(2), s.place[weaker, :2] - s.place[stronger, :2]])
-    anew = here + _around(starts.shape[0]) * AROUND_M
+    here = jnp.stack([jnp.zeros(3), (s.place[weaker] - s.place[stronger]).at[2].set(0.0)])
+    anew = jnp.where(mixed, _in_one_place(starts.shape[0]), here + _around(starts.shape[0]) * AROUND_M)
+    changes = jnp.where(mixed, _around_mixed(PART), _around(PART) * AROUND_M)
+    closer, rounds = jnp.where(mixed, CLOSER_MIXED, CLOSER), jnp.where(mixed, ROUNDS_MIXED, ROUNDS)
     parts = starts.shape[0] // PART
     looks = parts * numbers.shape[0]
 
@@ -100,15 +119,15 @@ def divided(problem: Problem, state: State) -> tuple[Two, State, jax.Array]:
         seeking = number < looks
         k = jnp.where(seeking, number // parts, best.number)
         again, rest = base(k)
-        first = jnp.where(again, anew, starts).reshape(parts, PART, 2, 2)[number % parts]
-        closer = best.offset_m + _around(PART) * AROUND_M * CLOSER ** (number - looks)
-        offsets = jnp.where(seeking, first, closer)
-        possible = again | ~(full | (beside & (k == weaker)))
+        first = jnp.where(again, anew, starts).reshape(parts, PART, 2, 3)[number % parts]
+        offsets = jnp.where(seeking, first, best.offset_m + changes * closer ** (number - looks))
+        possible = again | ~(mixed | full | (beside & (k == weaker)))
         asked = jnp.where(seeking, s.present[k] & possible, best.second.fit.likelihood > -jnp.inf)
         slot = jnp.where(again, weaker, jnp.argmin(s.present)).astype(jnp.int32)
+        nuclide, share = s.nuclide[jnp.where(again, weaker, k)], jnp.where(mixed, 1.0, 0.5)
 
         def best_of() -> Two:
-            two = each(lambda x: _as_two(problem, rest, k, slot, x), offsets, TOGETHER)
+            two = each(lambda x: _as_two(problem, rest, k, slot, share, nuclide, x), offsets, TOGETHER)
             top = jnp.argmax(two.second.fit.likelihood)
             found = jax.tree.map(lambda x: x[top], two)
             better = found.second.fit.likelihood > best.second.fit.likelihood
@@ -117,16 +136,16 @@ def divided(problem: Problem, state: State) -> tuple[Two, State, jax.Array]:
         return for_those(asked, best_of, lambda: best)
 
     zero = jnp.int32(0)
-    shape = jax.eval_shape(lambda: _as_two(problem, state, zero, zero, starts[0]))
+    shape = jax.eval_shape(lambda: _as_two(problem, state, zero, zero, jnp.float32(1.0), zero, starts[0]))
     nothing: Two = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
     nobody = replace(nothing.second.fit, likelihood=-jnp.asarray(jnp.inf))
     nothing = replace(nothing, second=replace(nothing.second, fit=nobody))
-    two = jax.lax.fori_loop(0, looks + ROUNDS, look, nothing)
+    two = jax.lax.fori_loop(0, looks + rounds, look, nothing)
     k, rest = two.number, base(two.number)[1]
     sources = replace(
         rest.sources,
         place=rest.sources.place.at[k].set(two.place),
-        activity_bq=rest.sources.activity_bq.at[k].multiply(0.5),
+        activity_bq=rest.sources.activity_bq.at[k].multiply(jnp.where(mixed, 1.0, 0.5)),
     )
     added = Others(
         counts=rest.added.counts.at[k].set(two.first.counts), variance=rest.added.variance.at[k].set(two.first.variance)
@@ -135,51 +154,84 @@ def divided(problem: Problem, state: State) -> tuple[Two, State, jax.Array]:
     return two, with_first, 2.0 * (two.second.fit.likelihood - state.likelihood)
 
 
-def _nearest(s: Sources) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The two nearest of one nuclide: the stronger and the weaker one [], and whether [] they are companions."""
-    apart = _apart_m(s, s.activity_bq)
+def _nearest(s: Sources, mixed: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The two nearest of one nuclide, or of two if ``mixed``: the stronger and the weaker one [], and whether [] they
+    are companions."""
+    apart = _apart_m(s, s.activity_bq, mixed)
     weaker, stronger = jnp.unravel_index(jnp.argmin(apart), apart.shape)
     return stronger, weaker, jnp.min(apart) < COMPANION_M
 
 
-def _apart_m(s: Sources, strength: jax.Array) -> jax.Array:
-    """Distances [K, K] of each source from each of its nuclide of more ``strength`` [K]; infinite from all others."""
+def _apart_m(s: Sources, strength: jax.Array, mixed: jax.Array | bool = False) -> jax.Array:
+    """Distances [K, K] of each source from each of more ``strength`` [K] of its nuclide, or of others if ``mixed``.
+
+    Infinite from all others.
+    """
     apart = jnp.linalg.norm(s.place[:, None, :2] - s.place[:, :2], axis=-1)
-    alike = (s.nuclide[:, None] == s.nuclide) & s.present[:, None] & s.present
+    asked = ((s.nuclide[:, None] == s.nuclide) != mixed) & s.present[:, None] & s.present
     numbers = jnp.arange(strength.shape[0])
     less = (strength[:, None] < strength) | ((strength[:, None] == strength) & (numbers[:, None] > numbers))
-    return jnp.where(alike & less, apart, jnp.inf)
+    return jnp.where(asked & less, apart, jnp.inf)
 
 
 def _around(count: int) -> jax.Array:
-    """Changes [count, 2, 2] of the places of two, within 1, that fill the space of both evenly; the first is none."""
+    """Changes [count, 2, 3] of the places of two, within 1, that fill the plane of both evenly; the first is none."""
     share = jnp.mod(jnp.arange(count)[:, None] * jnp.array(_EVEN), 1.0)
-    radius, angle = jnp.sqrt(share[:, :2]), 2.0 * jnp.pi * share[:, 2:]
-    return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=-1)
+    return _flat(jnp.sqrt(share[:, :2]), 2.0 * jnp.pi * share[:, 2:])
+
+
+def _around_mixed(count: int) -> jax.Array:
+    """Changes [count, 2, 3] of the places of two of different nuclides: of both by the same, of the second besides."""
+    share = jnp.mod((jnp.arange(count)[:, None] + 0.5) * jnp.array(_EVEN_MIXED), 1.0)
+    change = _flat(jnp.sqrt(share[:, :2]), 2.0 * jnp.pi * share[:, 2:4]).at[..., 2].set(2.0 * share[:, 4:] - 1.0)
+    both, second = change[:, 0] * AROUND_MIXED_M, change[:, 1] * AROUND_MIXED_M * APART_MIXED
+    return jnp.stack([both, both + second], axis=1)
+
+
+def _in_one_place(count: int) -> jax.Array:
+    """Places [count, 2, 3] of two in one place, from that of the first of them."""
+    index = jnp.arange(count)
+    way = _flat(FAR_MIXED_M * jnp.sqrt(index / count), GOLDEN_ANGLE_RAD * index)
+    return jnp.stack([way, way], axis=1)
 
 
 def _offsets() -> jax.Array:
-    """Places [m, 2, 2] of the first and of the second source, from that of the one: m pairs of them."""
-    angle = 2.0 * jnp.pi * jnp.arange(DIRECTIONS) / DIRECTIONS
-    way = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    """Places [m, 2, 3] of the first and of the second source, from that of the one: m pairs of them."""
+    way = _flat(jnp.ones(DIRECTIONS), 2.0 * jnp.pi * jnp.arange(DIRECTIONS) / DIRECTIONS)
     half = way[: DIRECTIONS // 2]
     sides = [jnp.stack([half, -half], axis=1) * side for side in SIDES_M]
     return jnp.concatenate(sides + [jnp.stack([jnp.zeros_like(way), way], axis=1) * away for away in AWAY_M])
 
 
-def _as_two(problem: Problem, state: State, k: jax.Array, slot: jax.Array, offset_m: jax.Array) -> Two:
-    """Source ``k`` [] as two, at so far [2, 2] from its place: the first with half of its activity, and a second."""
+def _flat(radius: jax.Array, angle: jax.Array) -> jax.Array:
+    """Places [..., 3] around the origin, in its plane."""
+    return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.zeros_like(radius)], axis=-1)
+
+
+def _as_two(
+    problem: Problem,
+    state: State,
+    k: jax.Array,
+    slot: jax.Array,
+    share: jax.Array,
+    nuclide: jax.Array,
+    offset_m: jax.Array,
+) -> Two:
+    """Source ``k`` [] as two, at so far [2, 3] from its place: with a ``share`` [] of its activity, and a second.
+
+    The second is of ``nuclide`` [], and is to stand in ``slot`` [].
+    """
     s, (low, high) = state.sources, bounds(problem)
-    place = jnp.clip(s.place[k] + jnp.pad(offset_m, ((0, 0), (0, 1))), low, high)
+    place = jnp.clip(s.place[k] + offset_m, low, high)
     ways = ways_from(problem, place[0])
     found = rates(problem, ways, s.nuclide[k], state.unknowns.lengths)
     first = Others(
-        counts=0.5 * s.activity_bq[k] * found.counts, variance=variance_of(problem, ways.position_m) + found.edge
+        counts=share * s.activity_bq[k] * found.counts, variance=variance_of(problem, ways.position_m) + found.edge
     )
     added = Others(
         counts=state.added.counts.at[k].set(first.counts), variance=state.added.variance.at[k].set(first.variance)
     )
-    second = attempt(problem, s.nuclide[k], added, state.unknowns, place[1])
+    second = attempt(problem, nuclide, added, state.unknowns, place[1])
     return Two(number=k.astype(jnp.int32), slot=slot, offset_m=offset_m, place=place[0], first=first, second=second)
 
 

@@ -16,7 +16,7 @@ from swarmsim.estimation.fit import FLAT, Settled
 from swarmsim.estimation.forward import Problem, Rates, variance_of
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.normal_equations import Others
-from swarmsim.estimation.pairs import divided, divisible, joined, strain
+from swarmsim.estimation.pairs import are_mixed, divided, divisible, joined, strain
 from swarmsim.estimation.scan import scan, strongest
 from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
 from swarmsim.estimation.state import State, ratios, settled, shared, signals, without
@@ -127,26 +127,32 @@ def find_sources(
 
 
 def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
-    """At the end: two sources in the place of one, or of two, if windows' rates depart from the model without that.
+    """Two sources in the place of one, or of two, if windows' rates depart from the model without that.
 
-    Both are sought again, and then tried as all others are.
+    At the end, and two of different nuclides before others are added, which would explain what these do not. Both are
+    sought again, and then tried as all others are.
     """
     sources = p.state.sources
     # enough are left to try them
     enough = p.left > sources.present.shape[0] + 2
-    open_ = p.over & ~p.closing & ~p.trial & enough & (p.divisions > 0)
-    now = open_ & divisible(sources) & (strain(problem, p.state)[0] > params.further)
+    open_ = ~jnp.any(p.again) & ~p.closing & ~p.trial & enough & (p.divisions > 0)
+    mixed = are_mixed(sources) & ~(p.over & divisible(sources))
+    possible = open_ & (mixed | (p.over & divisible(sources)))
+    now = possible & (strain(problem, p.state)[0] > params.further)
 
     def divide() -> _Progress:
-        two, state, ratio = divided(problem, p.state)
+        two, state, ratio = divided(problem, p.state, mixed)
         state, numbers = _with(problem, state, two.slot, two.second), jnp.arange(sources.present.shape[0])
-        table = state.sources.nuclide_value.at[two.slot].set(state.sources.nuclide_value[two.number])
+        from_ = jnp.where(mixed, two.slot, two.number)
+        table = state.sources.nuclide_value.at[two.slot].set(state.sources.nuclide_value[from_])
         state = replace(state, sources=replace(state.sources, nuclide_value=table))
         both = (numbers == two.number) | (numbers == two.slot)
-        after = replace(p, state=state, again=both, made=both, over=jnp.array(False), divisions=p.divisions - 1)
+        made = jnp.where(mixed, p.made, both)
+        after = replace(p, state=state, again=both, made=made, over=jnp.array(False), divisions=p.divisions - 1)
         better = ratio > HOPELESS * params.further
         # what cannot be divided now cannot be later
-        return jax.tree.map(partial(jnp.where, better), after, replace(p, divisions=jnp.int32(0)))
+        fewer = jnp.where(mixed, p.divisions - 1, 0)
+        return jax.tree.map(partial(jnp.where, better), after, replace(p, divisions=fewer))
 
     return for_those(now, divide, lambda: p)
 

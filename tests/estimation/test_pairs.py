@@ -1,4 +1,4 @@
-"""Sources of one nuclide beside one another: one that is rather two, two that are rather one, and what is not known."""
+"""Sources beside one another: one that is rather two, two that are rather one, two nuclides, and what is not known."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ import pytest
 from swarmsim.estimation import localisation_params, pairs, sources
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.pairs import divided, joined, strain
+from swarmsim.estimation.pairs import are_mixed, divided, joined, strain
 from swarmsim.estimation.posterior import of_others
 from swarmsim.estimation.search import looked_at, screen_of
 from swarmsim.estimation.sources import as_known
@@ -22,11 +22,15 @@ SITE = place(NOWHERE)
 KNOWN, PARAMS = presumed(SITE, DETECTORS), localisation_params(spec())
 CERTAIN = replace(KNOWN, background_std=jnp.float32(0.01), model_std=jnp.float32(0.001), height_std_m=jnp.float32(0.05))
 AT = np.array([*SOURCE[:2], 1.0])
+DIVIDED = jax.jit(divided)
 
 
 def state_of(truth, given=None, known=KNOWN, seed=None, nuclides=None):
-    """The problem of the counts of ``truth``, and a state with the sources ``given``: (place, activity) each."""
-    mean = mean_rois(SITE, DETECTORS, BOTH, [(at, activity, "Co-60") for at, activity in truth])
+    """The problem of the counts of ``truth``, and a state with the sources ``given``: (place, activity) each.
+
+    They are of Co-60, unless the third of a source's values is another name; those given are of ``nuclides``.
+    """
+    mean = mean_rois(SITE, DETECTORS, BOTH, [(*one, "Co-60")[:3] for one in truth])
     problem = problem_of(known, drawn(BOTH, mean, seed) if seed is not None else replace(BOTH, rois=mean), SPANS)
     if known is CERTAIN:
         problem = replace(problem, pose_std_m=jnp.zeros_like(problem.pose_std_m))
@@ -118,12 +122,34 @@ def test_a_source_is_divided_where_two_others_beside_one_another_are_right():
     others = replace(state.unknowns, others=jnp.ones(4))
     added = jax.tree.map(lambda x: jnp.concatenate([x, jnp.zeros_like(x[:1])]), state.added)
     state = replace(state, sources=sources_, unknowns=others, added=added)
-    two, with_first, ratio = jax.jit(divided)(problem, state)
+    two, with_first, ratio = DIVIDED(problem, state, jnp.array(False))
     assert int(two.number) == 2
     assert int(two.slot) == 3
     assert float(ratio) > float(PARAMS.search.further)
     found = np.sort([float(with_first.sources.place[2, 0]), float(two.second.place[0])])
     np.testing.assert_allclose(found, SOURCE[0] + np.array([-2.0, 2.0]), atol=0.5)
+
+
+@pytest.mark.parametrize("off", [(4.0, 4.3), (-3.0, 2.0)])
+def test_two_nuclides_in_one_place_are_sought_together(off):
+    """From where the survey had them: each by itself follows the other, wherever that is."""
+    truth = [(AT, 150e6), (AT, 200e6, "Cs-137")]
+    problem, state = state_of(truth, [(east(off[0]), 150e6), (east(off[1]), 200e6)], nuclides=[0, 1], seed=4)
+    assert bool(are_mixed(state.sources))
+    two, with_first, ratio = DIVIDED(problem, state, jnp.array(True))
+    assert float(ratio) > float(PARAMS.search.further)
+    first, slot = int(two.number), int(two.slot)
+    assert {first, slot} == {0, 1}
+    assert int(two.second.nuclide) == slot  # each keeps its nuclide
+    np.testing.assert_allclose(with_first.sources.place[first, :2], AT[:2], atol=0.3)
+    np.testing.assert_allclose(two.second.place[:2], AT[:2], atol=0.3)
+
+
+def test_mixed_are_two_of_different_nuclides_beside_one_another():
+    for apart, nuclides, mixed in ((4.0, [0, 1], True), (4.0, [1, 1], False), (14.0, [0, 1], False)):
+        _, state = state_of([(AT, ACTIVITY), (east(apart), ACTIVITY)], nuclides=nuclides)
+        assert bool(are_mixed(state.sources)) == mixed
+        assert not bool(are_mixed(without(state, jnp.int32(0)).sources))
 
 
 def test_one_source_strains_nothing_and_two_taken_for_one_do():

@@ -51,7 +51,7 @@ def test_a_ratio_of_nothing_is_that_of_its_own_source():
 
 
 def test_pairs_are_counted_by_what_was_told_of_them():
-    drawn = {"nuclide": "Co-60", "places": np.array([[0.0, 0.0], [4.0, 0.0]]), "mbq": np.array([100.0, 50.0])}
+    drawn = {"nuclides": ["Co-60"] * 2, "places": np.array([[0.0, 0.0], [4.0, 0.0]]), "mbq": np.array([100.0, 50.0])}
     plain = [with_joined(estimate(0.5), 0.0), with_joined(estimate(4.0), 0.0)]
     several = [with_joined(estimate(1.0, std=2.0), 4.0)]
     rows = [pairs.row_of(drawn, record([], estimates)) for estimates in (plain, several, plain[:1], [])]
@@ -69,6 +69,26 @@ def test_pairs_are_counted_by_what_was_told_of_them():
     assert pairs.summarised(rows)["by_limit"]["0.5 to 1"] == {"sources": 3, "told": 2, "doubted": 0}
     never = [pairs.row_of(drawn, record([], [with_joined(estimate(0.0), 0.0, np.inf)], "ambiguous"))]
     assert pairs.summarised(never)["by_limit"]["0 to 0.25"] == {"sources": 1, "told": 0, "doubted": 1}
+
+
+def test_of_two_nuclides_each_is_looked_for_where_its_own_is_told():
+    drawn = {"nuclides": ["Co-60", "Cs-137"], "places": np.zeros((2, 2)), "mbq": np.array([100.0, 50.0])}
+    right = [with_joined(estimate(0.5), 0.0), with_joined(estimate(0.0, nuclide="Cs-137"), 0.0)]
+    wrong = [right[0], with_joined(estimate(0.0, nuclide="Ba-133"), 0.0)]
+    rows = [pairs.row_of(drawn, record([], estimates)) for estimates in (right, wrong)]
+    assert [row["sigmas"] for row in rows] == [[1.0, 0.0], [1.0, np.inf]]
+    found = pairs.summarised(rows)
+    assert found["0 to 1 m"]["both_inside_95"] == 1
+    assert "by_limit" not in found
+
+
+def test_pairs_of_two_nuclides_are_drawn_with_two():
+    rng = np.random.default_rng(1)
+    some = [pairs._drawn(rng, True) for _ in range(60)]
+    assert all(len(set(one["nuclides"])) == 2 for one in some)
+    in_one = sum(np.array_equal(*one["places"]) for one in some)
+    assert 8 <= in_one <= 32
+    assert all(len(set(pairs._drawn(rng, False)["nuclides"])) == 1 for _ in range(20))
 
 
 def test_no_pairs_at_all_are_refused(tmp_path, capsys):
