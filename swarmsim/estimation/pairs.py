@@ -32,7 +32,8 @@ DIRECTIONS = 12
 AROUND_M = 1.0  # within which the places of both are changed together, in the first round
 CLOSER = 0.6  # the same in a further round, over that in the one before
 ROUNDS = 9
-FAR_MIXED_M = 8.0  # within which two of different nuclides are looked for in one place
+MIXED_M = 25.0  # within which two of different nuclides may be at wrong places because of one another
+FAR_MIXED_M = 8.0  # from where each of them was found, within which both are looked for in one place
 AROUND_MIXED_M = 2.0  # within which both are changed by the same, in the first round
 APART_MIXED = 0.5  # of that, within which the second is changed besides
 CLOSER_MIXED = 0.7
@@ -86,12 +87,12 @@ def divisible(s: Sources) -> jax.Array:
 
 
 def are_mixed(s: Sources) -> jax.Array:
-    """Whether [] two of different nuclides are companions."""
+    """Whether [] two of different nuclides stand within `MIXED_M`."""
     return _nearest(s, jnp.array(True))[2]
 
 
 def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, State, jax.Array]:
-    """Two sources in the place of one; the two nearest to one another, if they are companions, are placed anew.
+    """Two sources in the place of one; the two nearest to one another, if they are near enough, are placed anew.
 
     With ``mixed`` [] only the two nearest of different nuclides are: in one place first, then apart.
 
@@ -104,7 +105,8 @@ def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, Stat
     pair = without(state, weaker)
     starts = _offsets()
     here = jnp.stack([jnp.zeros(3), (s.place[weaker] - s.place[stronger]).at[2].set(0.0)])
-    anew = jnp.where(mixed, _in_one_place(starts.shape[0]), here + _around(starts.shape[0]) * AROUND_M)
+    in_one = jnp.concatenate([_in_one_place(starts.shape[0] // 2) + at for at in here])
+    anew = jnp.where(mixed, in_one, here + _around(starts.shape[0]) * AROUND_M)
     changes = jnp.where(mixed, _around_mixed(PART), _around(PART) * AROUND_M)
     closer, rounds = jnp.where(mixed, CLOSER_MIXED, CLOSER), jnp.where(mixed, ROUNDS_MIXED, ROUNDS)
     parts = starts.shape[0] // PART
@@ -155,11 +157,13 @@ def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, Stat
 
 
 def _nearest(s: Sources, mixed: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The two nearest of one nuclide, or of two if ``mixed``: the stronger and the weaker one [], and whether [] they
-    are companions."""
+    """The two nearest of one nuclide, or of two if ``mixed``, the stronger and the weaker one [].
+
+    And whether [] they are near enough to be placed anew.
+    """
     apart = _apart_m(s, s.activity_bq, mixed)
     weaker, stronger = jnp.unravel_index(jnp.argmin(apart), apart.shape)
-    return stronger, weaker, jnp.min(apart) < COMPANION_M
+    return stronger, weaker, jnp.min(apart) < jnp.where(mixed, MIXED_M, COMPANION_M)
 
 
 def _apart_m(s: Sources, strength: jax.Array, mixed: jax.Array | bool = False) -> jax.Array:
@@ -189,7 +193,7 @@ def _around_mixed(count: int) -> jax.Array:
 
 
 def _in_one_place(count: int) -> jax.Array:
-    """Places [count, 2, 3] of two in one place, from that of the first of them."""
+    """Places [count, 2, 3] of two in one place, from where one was found."""
     index = jnp.arange(count)
     way = _flat(FAR_MIXED_M * jnp.sqrt(index / count), GOLDEN_ANGLE_RAD * index)
     return jnp.stack([way, way], axis=1)
