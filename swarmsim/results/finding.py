@@ -4,7 +4,7 @@ import math
 
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
 from swarmsim.results.record import Estimate, Spectrum
-from swarmsim.results.status import Verdict, in_mbq
+from swarmsim.results.status import CONFIRMED, Verdict, in_mbq
 
 NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"
@@ -36,7 +36,7 @@ def finding(
 def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, by: str) -> str:
     if not final:
         return NOTHING_FOUND
-    first = _surest(final[0], spectrum, no_way, by)
+    first = _surest(final[0], spectrum, no_way, by) + _besides(final, spectrum)
     if len(final) == 1:
         return f"a source of {first}"
     others = "; ".join(f"of {_placed(one)}" for one in final[1:])
@@ -61,6 +61,17 @@ def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str
     if spectrum is None:
         return f"{place}; {by}, no spectrum was taken near it"
     return f"{place}; {_identified(estimate, spectrum, by)}"
+
+
+def _besides(final: tuple[Estimate, ...], spectrum: Spectrum | None) -> str:
+    """What the spectrum shows besides the nuclides of the sources: a weak one in the same place, or farther off."""
+    if spectrum is None:
+        return ""
+    told = {one.nuclide for one in final} | {spectrum.nuclide}
+    names = [name for name, score in spectrum.scores.items() if score > CONFIRMED and name not in told]
+    if not names:
+        return ""
+    return f", and the spectrum shows {' and '.join(names)} as well, of which the counts tell no source"
 
 
 def _identified(estimate: Estimate, spectrum: Spectrum, by: str) -> str:

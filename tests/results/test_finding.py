@@ -44,6 +44,17 @@ def test_a_spectrum_that_names_it_says_how_well():
     assert "fits the spectrum badly (p = 1e-05)" in finding(SURE, ONE, spectrum(named, 1e-5), False, False)
 
 
+def test_it_says_what_the_spectrum_shows_besides():
+    also = replace(spectrum("Co-60"), scores={"Co-60": 0.97, "I-131": 0.95, "Cs-137": 0.5, "Na-22": 0.99})
+    pair = (*ONE, estimate(30.0, nuclide="Na-22"))
+    said = ", and the spectrum shows I-131 as well, of which the counts tell no source"
+    assert said in finding(SURE, pair, also, False, False)
+    assert "I-131 and Na-22 as well" in finding(SURE, ONE, also, False, False)
+    told = replace(also, scores={"Co-60": 0.97, "Cs-137": 0.89})
+    assert "as well" not in finding(SURE, ONE, told, False, False)
+    assert "as well" not in finding(SURE, ONE, None, False, False)
+
+
 def test_a_source_that_may_be_several_is_told_so():
     joined = (replace(estimate(), joined_m=2.4),)
     assert "m (or several within 3 m, or behind other walls than presumed); " in finding(
