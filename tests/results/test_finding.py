@@ -47,7 +47,7 @@ def test_a_spectrum_that_names_it_says_how_well():
 def test_it_says_what_the_spectrum_shows_besides():
     also = replace(spectrum("Co-60"), scores={"Co-60": 0.97, "I-131": 0.95, "Cs-137": 0.5, "Na-22": 0.99})
     pair = (*ONE, estimate(30.0, nuclide="Na-22"))
-    said = ", and the spectrum shows I-131 as well, of which the counts tell no source"
+    said = ", but the spectrum fits better with I-131 as well: a weak source, or walls other than presumed"
     assert said in finding(SURE, pair, also, False, False)
     assert "I-131 and Na-22 as well" in finding(SURE, ONE, also, False, False)
     told = replace(also, scores={"Co-60": 0.97, "Cs-137": 0.89})
