@@ -32,7 +32,6 @@ DIRECTIONS = 12
 AROUND_M = 1.0  # within which the places of both are changed together, in the first round
 CLOSER = 0.6  # the same in a further round, over that in the one before
 ROUNDS = 9
-MIXED_M = 25.0  # within which two of different nuclides may be at wrong places because of one another
 FAR_MIXED_M = 8.0  # from where each of them was found, within which both are looked for in one place
 AROUND_MIXED_M = 2.0  # within which both are changed by the same, in the first round
 APART_MIXED = 0.5  # of that, within which the second is changed besides
@@ -87,7 +86,7 @@ def divisible(s: Sources) -> jax.Array:
 
 
 def are_mixed(s: Sources) -> jax.Array:
-    """Whether [] two of different nuclides stand within `MIXED_M`."""
+    """Whether [] two of different nuclides stand within `COMPANION_M`."""
     return _nearest(s, jnp.array(True))[2]
 
 
@@ -163,7 +162,7 @@ def _nearest(s: Sources, mixed: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     """
     apart = _apart_m(s, s.activity_bq, mixed)
     weaker, stronger = jnp.unravel_index(jnp.argmin(apart), apart.shape)
-    return stronger, weaker, jnp.min(apart) < jnp.where(mixed, MIXED_M, COMPANION_M)
+    return stronger, weaker, jnp.min(apart) < COMPANION_M
 
 
 def _apart_m(s: Sources, strength: jax.Array, mixed: jax.Array | bool = False) -> jax.Array:

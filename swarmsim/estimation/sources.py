@@ -36,6 +36,7 @@ MOST_TOLERANT = 0.5
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 DIVISIONS = 4  # of one into two, or of two into other two, at most
+MIXINGS = 4  # times that two of different nuclides are placed together, at most
 
 
 @pytree
@@ -70,6 +71,7 @@ class _Progress:
     over: jax.Array  # [] bool
     left: jax.Array  # [] int32, seeks at most
     divisions: jax.Array  # [] int32, how often one may still be taken for two, or two be placed anew
+    mixings: jax.Array  # [] int32, how often two of different nuclides may still be placed together
     made: jax.Array  # [K] bool, sources that the last division made
     closing: jax.Array  # [] bool, whether companions have been joined: no more sources are added
 
@@ -100,6 +102,7 @@ def find_sources(
     start = _Progress(
         state=first, again=first.sources.present, wide=~no, trial=no, before=first, over=no,
         left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max), divisions=jnp.int32(DIVISIONS), closing=no,
+        mixings=jnp.int32(MIXINGS),
         made=jnp.zeros_like(first.sources.present),
     )  # fmt: skip
 
@@ -135,9 +138,10 @@ def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
     sources = p.state.sources
     # enough are left to try them
     enough = p.left > sources.present.shape[0] + 2
-    open_ = ~jnp.any(p.again) & ~p.closing & ~p.trial & enough & (p.divisions > 0)
-    mixed = are_mixed(sources) & ~(p.over & divisible(sources))
-    possible = open_ & (mixed | (p.over & divisible(sources)))
+    open_ = ~jnp.any(p.again) & ~p.closing & ~p.trial & enough
+    ends = p.over & divisible(sources) & (p.divisions > 0)
+    mixed = are_mixed(sources) & (p.mixings > 0) & ~ends
+    possible = open_ & (mixed | ends)
     now = possible & (strain(problem, p.state)[0] > params.further)
 
     def divide() -> _Progress:
@@ -147,12 +151,13 @@ def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
         table = state.sources.nuclide_value.at[two.slot].set(state.sources.nuclide_value[from_])
         state = replace(state, sources=replace(state.sources, nuclide_value=table))
         both = (numbers == two.number) | (numbers == two.slot)
-        made = jnp.where(mixed, p.made, both)
-        after = replace(p, state=state, again=both, made=made, over=jnp.array(False), divisions=p.divisions - 1)
+        once = mixed.astype(jnp.int32)
+        tried = replace(p, mixings=p.mixings - once, divisions=p.divisions - (1 - once))
+        after = replace(tried, state=state, again=both, made=jnp.where(mixed, p.made, both), over=jnp.array(False))
         better = ratio > HOPELESS * params.further
         # what cannot be divided now cannot be later
-        fewer = jnp.where(mixed, p.divisions - 1, 0)
-        return jax.tree.map(partial(jnp.where, better), after, replace(p, divisions=fewer))
+        hopeless = replace(tried, divisions=jnp.where(mixed, p.divisions, 0))
+        return jax.tree.map(partial(jnp.where, better), after, hopeless)
 
     return for_those(now, divide, lambda: p)
 

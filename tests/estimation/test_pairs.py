@@ -146,7 +146,7 @@ def test_two_nuclides_in_one_place_are_sought_together(off):
 
 
 def test_mixed_are_two_of_different_nuclides_beside_one_another():
-    for apart, nuclides, mixed in ((4.0, [0, 1], True), (4.0, [1, 1], False), (26.0, [0, 1], False)):
+    for apart, nuclides, mixed in ((4.0, [0, 1], True), (4.0, [1, 1], False), (14.0, [0, 1], False)):
         _, state = state_of([(AT, ACTIVITY), (east(apart), ACTIVITY)], nuclides=nuclides)
         assert bool(are_mixed(state.sources)) == mixed
         assert not bool(are_mixed(without(state, jnp.int32(0)).sources))
@@ -247,7 +247,7 @@ def test_what_a_division_made_and_a_trial_refuted_is_not_made_again():
     begun = sources._Progress(
         state=one, again=jnp.zeros(2, bool), wide=jnp.array(False), trial=jnp.array(True), before=two,
         over=jnp.array(False), left=jnp.int32(9), divisions=jnp.int32(3), made=jnp.ones(2, bool),
-        closing=jnp.array(False),
+        mixings=jnp.int32(0), closing=jnp.array(False),
     )  # fmt: skip
     least, now = PARAMS.search.further, jnp.array(True)
     assert int(sources._ended_trial(least, begun, now).divisions) == 0
