@@ -226,22 +226,26 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
 
 
 @jax.jit
-def joint_information(problem: Problem, model: Linearised, u: Unknowns, places_m: jax.Array) -> jax.Array:
-    """Information [4 K, 4 K] about (x, y, height, log activity) of each of the sources at ``places_m`` [K, 3] (world).
+def joint_equations(
+    problem: Problem, model: Linearised, u: Unknowns, places_m: jax.Array
+) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    """Normal equations [4 K, 4 K], [4 K] of (x, y, height, log activity) of each of the sources at ``places_m`` [K, 3].
 
-    The levels are eliminated; as if nothing were in the way. ``model`` has no source but the K others.
+    Places are in the world. The levels are eliminated; as if nothing were in the way. ``model`` has no source but the K
+    others.
     """
     count, levels = u.others.shape[0], len(problem.detectors)
-    products = _eliminated(problem, model, u).products
+    e = _eliminated(problem, model, u)
     offset = places_m[:, None] - problem.measurements.position_m
     squared = jnp.maximum(jnp.sum(offset * offset, axis=-1, keepdims=True), 0.01)
     nearer = jnp.concatenate([-2.0 * offset / squared, jnp.ones_like(squared)], axis=-1)  # [K, n, 4]
     factor = jnp.concatenate([jnp.swapaxes(nearer, 1, 2).reshape(4 * count, -1), detector_of(problem).T])
     column = np.array([*np.repeat(1 + np.arange(count), 4), *[1 + count] * levels])
-    whole = jnp.sum(products[column][:, column] * factor[:, None] * factor, axis=-1)
+    whole = jnp.sum(e.products[column][:, column] * factor[:, None] * factor, axis=-1)
+    push = jnp.sum(e.pushes[column] * factor, axis=-1)
     own, across = whole[: 4 * count, : 4 * count], whole[: 4 * count, 4 * count :]
-    of_levels = whole[4 * count :, 4 * count :] + LOOSE * jnp.eye(levels)
-    return own - across @ scaled_inverse(of_levels) @ across.T
+    of_levels = across @ scaled_inverse(whole[4 * count :, 4 * count :] + LOOSE * jnp.eye(levels))
+    return own - of_levels @ across.T, push[: 4 * count] - of_levels @ push[4 * count :]
 
 
 def _products(one: jax.Array, other: jax.Array) -> jax.Array:

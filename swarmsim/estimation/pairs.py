@@ -18,30 +18,32 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from swarmsim.device import each, for_those, repeat_while
+from swarmsim.estimation.fit import FLAT
 from swarmsim.estimation.forward import Problem, rates, silent, variance_of, ways_from
-from swarmsim.estimation.normal_equations import Others, linearised, normal_equations
-from swarmsim.estimation.search import GOLDEN_ANGLE_RAD, TOGETHER, Tried, attempt, bounds
+from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
+from swarmsim.estimation.normal_equations import LOOSE, Others, joint_equations, linearised, normal_equations
+from swarmsim.estimation.search import FARTHEST, GOLDEN_ANGLE_RAD, TOGETHER, Tried, attempt, bounds, mirrored_place
 from swarmsim.estimation.state import Sources, State, ratios, settled, without
 from swarmsim.pytree import pytree
 
 SIDES_M = (1.0, 2.0, 4.0)  # of two of about the same strength, from where one was found: on either side of it
 AWAY_M = (3.0, 5.5, 9.0)  # of a weaker one, from where the stronger was found
 DIRECTIONS = 12
-AROUND_M = 1.0  # within which the places of both are changed together, in the first round
-CLOSER = 0.6  # the same in a further round, over that in the one before
-ROUNDS = 9
-FAR_MIXED_M = 8.0  # from where each of them was found, within which both are looked for in one place
-AROUND_MIXED_M = 2.0  # within which both are changed by the same, in the first round
-APART_MIXED = 0.5  # of that, within which the second is changed besides
-CLOSER_MIXED = 0.7
-ROUNDS_MIXED = 16
+FAR_MIXED_M = 8.0  # from where two of different nuclides were found, within which both are looked for in one place
+AROUND_M = 2.0  # within which the places of both are changed by the same, in the first round
+APART = 0.5  # of that, within which that of the second is changed besides
+UP_STDS = 1.5  # standard deviations of a height, within which both are changed
+CLOSER = 0.65  # the same in a further round, over that in the one before
+ROUNDS = 13
+ALONG = 8  # of the places of a round the first that do not lie along what the counts leave open
+OVER = (1.0, 0.8)  # of the way to the other side, for either: where vehicles circle a source it is less far
 PART = 18  # pairs of places that are tried in a step
-# fractional parts of multiples of these fill four and six dimensions evenly: powers of the roots of x^5 = x + 1 (as in
-# `swarmsim.estimation.importance_sampling`) and x^7 = x + 1
-_EVEN = (0.8566749, 0.7338919, 0.6287067, 0.5385972)
-_EVEN_MIXED = (0.8986537, 0.8075785, 0.7257334, 0.6521828, 0.5860865, 0.5266888)
+# fractional parts of multiples of these fill six dimensions evenly: powers of the root of x^7 = x + 1 (as in
+# `swarmsim.estimation.importance_sampling`)
+_EVEN = (0.8986537, 0.8075785, 0.7257334, 0.6521828, 0.5860865, 0.5266888)
 ONE_M = 3.0  # within it two sources of one nuclide are told as one
 COMPANION_M = 12.0  # within it the rates of two sources rise and fall together
 COMPANION_RATIO = 0.15
@@ -61,6 +63,7 @@ class Two:
     place: jax.Array  # [3] of the first
     first: Others  # what it adds [n, R], [n]
     second: Tried
+    value: jax.Array  # [] likelihood of both, less the prior of the first one's height over that which it had
 
 
 def strain(problem: Problem, state: State) -> tuple[jax.Array, jax.Array]:
@@ -93,7 +96,7 @@ def are_mixed(s: Sources) -> jax.Array:
 def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, State, jax.Array]:
     """Two sources in the place of one; the two nearest to one another, if they are near enough, are placed anew.
 
-    With ``mixed`` [] only the two nearest of different nuclides are: in one place first, then apart.
+    With ``mixed`` [] only the two nearest of different nuclides are: from where they are, and from one place.
 
     Returns:
         the two, the state with the first of them, and twice the logarithm of the likelihood ratio [] over ``state``.
@@ -104,10 +107,9 @@ def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, Stat
     pair = without(state, weaker)
     starts = _offsets()
     here = jnp.stack([jnp.zeros(3), (s.place[weaker] - s.place[stronger]).at[2].set(0.0)])
-    in_one = jnp.concatenate([_in_one_place(starts.shape[0] // 2) + at for at in here])
-    anew = jnp.where(mixed, in_one, here + _around(starts.shape[0]) * AROUND_M)
-    changes = jnp.where(mixed, _around_mixed(PART), _around(PART) * AROUND_M)
-    closer, rounds = jnp.where(mixed, CLOSER_MIXED, CLOSER), jnp.where(mixed, ROUNDS_MIXED, ROUNDS)
+    changes = _around(problem, PART)
+    in_one = [_in_one_place((starts.shape[0] - PART) // 2) + at for at in here]
+    anew = jnp.where(mixed, jnp.concatenate([*in_one, here + changes]), here + _around(problem, starts.shape[0]))
     parts = starts.shape[0] // PART
     looks = parts * numbers.shape[0]
 
@@ -116,32 +118,35 @@ def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, Stat
         again = beside & (k == stronger)
         return again, jax.tree.map(partial(jnp.where, again), pair, state)
 
+    def along(best: Two, rest: State, now: jax.Array, reach_m: jax.Array) -> jax.Array:
+        nothing = jnp.zeros((PART - ALONG, 2, 3))
+        return for_those(now, lambda: _along(problem, rest, best, reach_m), lambda: nothing)
+
     def look(number: jax.Array, best: Two) -> Two:
         seeking = number < looks
         k = jnp.where(seeking, number // parts, best.number)
         again, rest = base(k)
         first = jnp.where(again, anew, starts).reshape(parts, PART, 2, 3)[number % parts]
-        offsets = jnp.where(seeking, first, best.offset_m + changes * closer ** (number - looks))
+        smaller = CLOSER ** (number - looks)
+        near = (changes * smaller).at[ALONG:].set(along(best, rest, ~seeking, AROUND_M * smaller))
+        offsets = jnp.where(seeking, first, best.offset_m + near)
         possible = again | ~(mixed | full | (beside & (k == weaker)))
-        asked = jnp.where(seeking, s.present[k] & possible, best.second.fit.likelihood > -jnp.inf)
+        asked = jnp.where(seeking, s.present[k] & possible, best.value > -jnp.inf)
         slot = jnp.where(again, weaker, jnp.argmin(s.present)).astype(jnp.int32)
         nuclide, share = s.nuclide[jnp.where(again, weaker, k)], jnp.where(mixed, 1.0, 0.5)
 
         def best_of() -> Two:
             two = each(lambda x: _as_two(problem, rest, k, slot, share, nuclide, x), offsets, TOGETHER)
-            top = jnp.argmax(two.second.fit.likelihood)
-            found = jax.tree.map(lambda x: x[top], two)
-            better = found.second.fit.likelihood > best.second.fit.likelihood
-            return jax.tree.map(partial(jnp.where, better), found, best)
+            found = jax.tree.map(lambda x: x[jnp.argmax(two.value)], two)
+            return jax.tree.map(partial(jnp.where, found.value > best.value), found, best)
 
         return for_those(asked, best_of, lambda: best)
 
     zero = jnp.int32(0)
     shape = jax.eval_shape(lambda: _as_two(problem, state, zero, zero, jnp.float32(1.0), zero, starts[0]))
     nothing: Two = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
-    nobody = replace(nothing.second.fit, likelihood=-jnp.asarray(jnp.inf))
-    nothing = replace(nothing, second=replace(nothing.second, fit=nobody))
-    two = jax.lax.fori_loop(0, looks + rounds, look, nothing)
+    nothing = replace(nothing, value=-jnp.asarray(jnp.inf))
+    two = jax.lax.fori_loop(0, looks + ROUNDS, look, nothing)
     k, rest = two.number, base(two.number)[1]
     sources = replace(
         rest.sources,
@@ -152,7 +157,7 @@ def divided(problem: Problem, state: State, mixed: jax.Array) -> tuple[Two, Stat
         counts=rest.added.counts.at[k].set(two.first.counts), variance=rest.added.variance.at[k].set(two.first.variance)
     )
     with_first = replace(rest, sources=sources, added=added)
-    return two, with_first, 2.0 * (two.second.fit.likelihood - state.likelihood)
+    return two, with_first, 2.0 * (two.value - state.likelihood)
 
 
 def _nearest(s: Sources, mixed: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -177,18 +182,53 @@ def _apart_m(s: Sources, strength: jax.Array, mixed: jax.Array | bool = False) -
     return jnp.where(asked & less, apart, jnp.inf)
 
 
-def _around(count: int) -> jax.Array:
-    """Changes [count, 2, 3] of the places of two, within 1, that fill the plane of both evenly; the first is none."""
-    share = jnp.mod(jnp.arange(count)[:, None] * jnp.array(_EVEN), 1.0)
-    return _flat(jnp.sqrt(share[:, :2]), 2.0 * jnp.pi * share[:, 2:])
-
-
-def _around_mixed(count: int) -> jax.Array:
-    """Changes [count, 2, 3] of the places of two of different nuclides: of both by the same, of the second besides."""
-    share = jnp.mod((jnp.arange(count)[:, None] + 0.5) * jnp.array(_EVEN_MIXED), 1.0)
-    change = _flat(jnp.sqrt(share[:, :2]), 2.0 * jnp.pi * share[:, 2:4]).at[..., 2].set(2.0 * share[:, 4:] - 1.0)
-    both, second = change[:, 0] * AROUND_MIXED_M, change[:, 1] * AROUND_MIXED_M * APART_MIXED
+def _around(problem: Problem, count: int) -> jax.Array:
+    """Changes [count, 2, 3] of the places of two within `AROUND_M`: of both by the same, of the second besides."""
+    up = jnp.minimum(UP_STDS * problem.height_std_m / AROUND_M, 1.0)
+    share = jnp.mod((jnp.arange(count)[:, None] + 0.5) * jnp.array(_EVEN), 1.0)
+    change = _flat(jnp.sqrt(share[:, :2]), 2.0 * jnp.pi * share[:, 2:4]).at[..., 2].set(up * (2.0 * share[:, 4:] - 1.0))
+    both, second = change[:, 0] * AROUND_M, change[:, 1] * AROUND_M * APART
     return jnp.stack([both, both + second], axis=1)
+
+
+def _along(problem: Problem, state: State, two: Two, reach_m: jax.Array) -> jax.Array:
+    """Changes [`PART` - `ALONG`, 2, 3] of the places of ``two``, as far as the counts leave them open together.
+
+    Within ``reach_m``, but for either on the other side of the way. The first is the Gauss-Newton step of both.
+    """
+    k, slot, second = two.number, two.slot, two.second
+    u = replace(second.fit.unknowns, activity_bq=jnp.zeros(()))
+    u = replace(u, others=u.others.at[slot].set(1.0))
+    variance = variance_of(problem, position_of(problem.site, second.place)) + second.fit.rates.edge
+    counts = second.fit.unknowns.activity_bq * second.fit.rates.counts
+    added = Others(
+        counts=state.added.counts.at[k].set(two.first.counts).at[slot].set(counts),
+        variance=state.added.variance.at[k].set(two.first.variance).at[slot].set(variance),
+    )
+    places = state.sources.place.at[k].set(two.place).at[slot].set(second.place)
+    model = linearised(problem, silent(problem), added, jnp.zeros(3), u)
+    at = jax.vmap(lambda place: position_of(problem.site, place))(places)
+    information, push = joint_equations(problem, model, u, at)
+    both = (4 * jnp.stack([k, slot])[:, None] + jnp.arange(4)).reshape(8)
+    precise = height_precision(problem.height_std_m)
+    prior = jnp.array([FLAT, FLAT, precise, LOOSE] * 2)
+    above = jnp.array([0.0, 0.0, precise, 0.0] * 2) * (places[both // 4, jnp.array([2] * 8)] - problem.height_m)
+    covariance = scaled_inverse(information[both][:, both] + jnp.diag(prior))
+    step = covariance @ (push[both] - above)
+    moved = np.array([0, 1, 2, 4, 5, 6])
+    covariance, step = covariance[moved][:, moved], jnp.clip(jnp.nan_to_num(step[moved]), -reach_m, reach_m)
+    widest = jnp.sqrt(jnp.maximum(jnp.max(jnp.diagonal(covariance)), 1e-12))
+    root = jnp.linalg.cholesky(covariance / jnp.square(widest) + 1e-4 * jnp.eye(6))
+    share = jnp.mod((jnp.arange(PART - ALONG)[:, None] + 0.5) * jnp.array(_EVEN), 1.0)
+    drawn = jax.scipy.special.ndtri(share) @ root.T * jnp.minimum(reach_m, FARTHEST * widest)
+    drawn = drawn.at[0].set(step).reshape(-1, 2, 3)
+    over = [
+        mirrored_place(problem, place, jnp.sum(seen, axis=1)) - place
+        for place, seen in ((two.place, two.first.counts), (second.place, counts))
+    ]
+    nothing = jnp.zeros(3)
+    sides = [jnp.stack(pair) * part for part in OVER for pair in ((over[0], nothing), (nothing, over[1]))]
+    return drawn.at[1 : 1 + len(sides)].set(jnp.stack(sides))
 
 
 def _in_one_place(count: int) -> jax.Array:
@@ -235,7 +275,16 @@ def _as_two(
         counts=state.added.counts.at[k].set(first.counts), variance=state.added.variance.at[k].set(first.variance)
     )
     second = attempt(problem, nuclide, added, state.unknowns, place[1])
-    return Two(number=k.astype(jnp.int32), slot=slot, offset_m=offset_m, place=place[0], first=first, second=second)
+    above = jnp.square(place[0, 2] - problem.height_m) - jnp.square(s.place[k, 2] - problem.height_m)
+    return Two(
+        number=k.astype(jnp.int32),
+        slot=slot,
+        offset_m=place - s.place[k],
+        place=place[0],
+        first=first,
+        second=second,
+        value=second.fit.likelihood - 0.5 * height_precision(problem.height_std_m) * above,
+    )
 
 
 def joined(problem: Problem, state: State) -> tuple[State, jax.Array]:

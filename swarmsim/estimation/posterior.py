@@ -16,7 +16,7 @@ from swarmsim.estimation.fit import alone, settle
 from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
 from swarmsim.estimation.importance_sampling import Posterior, Weighed, drawn_evenly, flattened, sample_posterior
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
-from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, joint_information, normal_equations
+from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, joint_equations, normal_equations
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
 from swarmsim.estimation.search import (
     GOLDEN_ANGLE_RAD,
@@ -24,6 +24,7 @@ from swarmsim.estimation.search import (
     attempt,
     bounds,
     looked_at,
+    mirrored_place,
     screen_of,
     spread,
 )
@@ -91,7 +92,7 @@ def of_others(problem: Problem, state: State) -> jax.Array:
         low, high = bounds(problem)
         prior = jnp.append(12.0 / jnp.square(high - low), 1.0 / jnp.square(problem.log_activity_std))
         prior = jnp.tile(prior.at[2].set(height_precision(problem.height_std_m)), count)
-        information = problem.learning_rate * joint_information(problem, model, u, places) + jnp.diag(prior)
+        information = problem.learning_rate * joint_equations(problem, model, u, places)[0] + jnp.diag(prior)
         is_place, owner = jnp.arange(4 * count) % 4 < 3, jnp.arange(4 * count) // 4
         every = scaled_inverse(information)
 
@@ -173,24 +174,6 @@ def _ring() -> jax.Array:
     radius = jnp.sqrt(ONE_M**2 + (COMPANION_M**2 - ONE_M**2) * (index + 0.5) / PLACES_BESIDE)
     angle = GOLDEN_ANGLE_RAD * index
     return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.zeros(PLACES_BESIDE)], axis=-1)
-
-
-def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax.Array:
-    """The place [3] on the other side of the way from which most of a source's ``counts`` [n] came.
-
-    A vehicle that drives straight past a source does not know on which side of it that lies. The way is the line that
-    fits the windows' places best, weighted with the squares of the counts, so that it is the part next to the source.
-    """
-    m = problem.measurements
-    weight = jnp.square(jnp.where(m.valid, counts / jnp.maximum(jnp.max(counts), 1e-9), 0.0))
-    weight = weight / jnp.maximum(jnp.sum(weight), 1e-9)
-    offset = jnp.where(m.valid[:, None], m.position_m[:, :2] - place[:2], 0.0)
-    middle = weight @ offset
-    apart = jnp.where(m.valid[:, None], offset - middle, 0.0)
-    xx, yy, xy = (weight @ (apart[:, i] * apart[:, j]) for i, j in ((0, 0), (1, 1), (0, 1)))
-    angle = 0.5 * jnp.arctan2(2.0 * xy, xx - yy)
-    across = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
-    return place.at[:2].add(2.0 * jnp.dot(middle, across) * across)
 
 
 def goodness(problem: Problem, state: State) -> Goodness:

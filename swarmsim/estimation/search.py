@@ -195,6 +195,24 @@ def _pattern(count: int, turn: jax.Array) -> jax.Array:
     return jnp.stack([share * jnp.cos(angle), share * jnp.sin(angle), height], axis=-1)
 
 
+def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax.Array:
+    """The place [3] on the other side of the way from which most of a source's ``counts`` [n] came.
+
+    A vehicle that drives straight past a source does not know on which side of it that lies. The way is the line that
+    fits the windows' places best, weighted with the squares of the counts, so that it is the part next to the source.
+    """
+    m = problem.measurements
+    weight = jnp.square(jnp.where(m.valid, counts / jnp.maximum(jnp.max(counts), 1e-9), 0.0))
+    weight = weight / jnp.maximum(jnp.sum(weight), 1e-9)
+    offset = jnp.where(m.valid[:, None], m.position_m[:, :2] - place[:2], 0.0)
+    middle = weight @ offset
+    apart = jnp.where(m.valid[:, None], offset - middle, 0.0)
+    xx, yy, xy = (weight @ (apart[:, i] * apart[:, j]) for i, j in ((0, 0), (1, 1), (0, 1)))
+    angle = 0.5 * jnp.arctan2(2.0 * xy, xx - yy)
+    across = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
+    return place.at[:2].add(2.0 * jnp.dot(middle, across) * across)
+
+
 def best_of(
     problem: Problem, others: Others, u: Unknowns, screen: Screen, candidates: Candidates, best: Tried
 ) -> tuple[Tried, jax.Array]:

@@ -130,10 +130,12 @@ def test_a_source_is_divided_where_two_others_beside_one_another_are_right():
     np.testing.assert_allclose(found, SOURCE[0] + np.array([-2.0, 2.0]), atol=0.5)
 
 
-@pytest.mark.parametrize("off", [(4.0, 4.3), (-3.0, 2.0)])
-def test_two_nuclides_in_one_place_are_sought_together(off):
+@pytest.mark.parametrize(
+    ("apart", "off"), [(0.0, (4.0, 4.3)), (0.0, (-3.0, 2.0)), (2.0, (4.0, 4.0)), (5.0, (-1.5, 8.0))]
+)
+def test_two_nuclides_beside_one_another_are_sought_together(apart, off):
     """From where the survey had them: each by itself follows the other, wherever that is."""
-    truth = [(AT, 150e6), (AT, 200e6, "Cs-137")]
+    truth = [(AT, 150e6), (east(apart), 200e6, "Cs-137")]
     problem, state = state_of(truth, [(east(off[0]), 150e6), (east(off[1]), 200e6)], nuclides=[0, 1], seed=4)
     assert bool(are_mixed(state.sources))
     two, with_first, ratio = DIVIDED(problem, state, jnp.array(True))
@@ -141,8 +143,63 @@ def test_two_nuclides_in_one_place_are_sought_together(off):
     first, slot = int(two.number), int(two.slot)
     assert {first, slot} == {0, 1}
     assert int(two.second.nuclide) == slot  # each keeps its nuclide
-    np.testing.assert_allclose(with_first.sources.place[first, :2], AT[:2], atol=0.3)
-    np.testing.assert_allclose(two.second.place[:2], AT[:2], atol=0.3)
+    found = np.zeros((2, 2))
+    found[first], found[slot] = with_first.sources.place[first, :2], two.second.place[:2]
+    np.testing.assert_allclose(found, [AT[:2], east(apart)[:2]], atol=0.3)
+
+
+def test_a_height_that_is_known_is_not_left_for_two_nuclides():
+    known = replace(KNOWN, height_m=jnp.float32(1.0), height_std_m=jnp.float32(0.05))
+    truth = [(AT, 150e6), (AT, 200e6, "Cs-137")]
+    problem, state = state_of(truth, [(east(4.0), 150e6), (east(4.3), 200e6)], known, 4, [0, 1])
+    two, _, ratio = DIVIDED(problem, state, jnp.array(True))
+    heights = np.array([two.place[2], two.second.place[2]])
+    np.testing.assert_allclose(heights, 1.0, atol=0.1)
+    assert float(ratio) > float(PARAMS.search.further)
+    before = state.sources.place[two.number]
+    np.testing.assert_allclose(before + two.offset_m, [two.place, two.second.place], atol=1e-4)
+
+
+def test_two_nuclides_in_one_place_are_found_in_it(localiser):
+    """The survey has them metres apart, and the first that is sought by all counts goes to the other."""
+    counts = drawn(BOTH, mean_rois(SITE, DETECTORS, BOTH, [(AT, 150e6, "Co-60"), (AT, 250e6, "Cs-137")]), 2)
+    aerial = localiser(replace(counts, valid=counts.valid & (counts.detector == 0)))
+    fits = localiser(counts, known=aerial.state).fits
+    assert int(jnp.sum(fits.present)) == 2
+    assert {NUCLIDES[int(n)] for n in fits.nuclide[:2]} == {"Co-60", "Cs-137"}
+    np.testing.assert_allclose(fits.position_m[:2, :2], [AT[:2]] * 2, atol=0.3)
+
+
+@pytest.mark.parametrize(
+    ("mixed", "ratio", "left", "better"),
+    [(True, 500.0, 0.1, True), (True, 500.0, 0.9, False), (True, 5.0, 0.1, False), (False, 500.0, 0.9, True)],
+)
+def test_two_nuclides_are_placed_together_if_that_is_what_was_wrong(monkeypatch, mixed, ratio, left, better):
+    """Where another source is missing two wrong ones take up a little of it: the strain hardly falls."""
+    problem, state = state_of([(AT, ACTIVITY), (east(4.0), ACTIVITY)], nuclides=[0, 1 if mixed else 0])
+    moved = replace(state, sources=replace(state.sources, place=state.sources.place + 1.0))
+    tried = as_known(problem, moved, jnp.int32(1), jnp.array(False))
+    two = pairs.Two(
+        number=jnp.int32(0), slot=jnp.int32(1), offset_m=jnp.zeros((2, 3)), place=moved.sources.place[0],
+        first=state.added, second=tried, value=jnp.float32(0.0),
+    )  # fmt: skip
+    monkeypatch.setattr(sources, "divided", lambda *_: (two, moved, jnp.float32(ratio)))
+    strains = iter([1000.0, 1000.0 * left])
+    monkeypatch.setattr(sources, "strain", lambda *_: (jnp.float32(next(strains)), jnp.float32(0.0)))
+    no = jnp.array(False)
+    p = sources._Progress(
+        state=state, again=jnp.zeros(2, bool), wide=no, trial=no, before=state, over=jnp.array(not mixed),
+        left=jnp.int32(9), divisions=jnp.int32(3), mixings=jnp.int32(2), made=jnp.ones(2, bool), closing=no,
+    )  # fmt: skip
+    with jax.disable_jit():
+        after = sources._divided(problem, PARAMS.search, p)
+    assert bool(jnp.all(after.again)) == better
+    place = (moved if better else state).sources.place
+    np.testing.assert_allclose(after.state.sources.place[0], place[0], rtol=1e-6)
+    assert int(after.mixings) == 2 - mixed
+    assert int(after.divisions) == 3 - (not mixed)
+    # a division that is refuted later is not one that was placed together since
+    assert bool(jnp.all(after.made)) == (not (mixed and better))
 
 
 def test_mixed_are_two_of_different_nuclides_beside_one_another():

@@ -22,8 +22,8 @@ from swarmsim.estimation.importance_sampling import (
     sample_posterior,
 )
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.posterior import WEIGH_STEPS, mirrored_place, posteriors
-from swarmsim.estimation.search import attempt
+from swarmsim.estimation.posterior import WEIGH_STEPS, posteriors
+from swarmsim.estimation.search import attempt, mirrored_place
 from swarmsim.estimation.state import Sources, no_sources
 from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
 
