@@ -5,12 +5,15 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
 
-from swarmsim.config.vehicles import SkidSteer
+from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.policies.path import Path, limit_speed, resample
 from swarmsim.policies.protocol import Assignment
 from swarmsim.policies.routes import (
     at_centres,
+    clearance_at,
     coarsen,
     line_clearance,
     move_clearance,
@@ -26,6 +29,7 @@ ROUTE_POINTS = 1536
 ROVER_MARGIN_M = 0.3  # kept beside the rover's half width
 SMOOTHING_M = 1.0  # half width of the moving average that rounds the grid's corners
 CORNER_M = 0.3  # how far the rover may cut a corner
+LANDED_M = 0.5  # from where it started, within which a multirotor stands when it has landed
 ENTRY_CELLS = 2  # a route begins and ends at a cell at most this many away …
 ENTRY_SAMPLES = 12  # … to which the straight line is clear, as told by this many points of it
 NEARER_M = 0.05  # how much nearer to an obstacle than where it stands that line may lead
@@ -39,6 +43,7 @@ class RouteGrid:
 
     site: Site
     radius_m: jax.Array  # [] clearance that the rover needs
+    standing_m: jax.Array  # [V, 3] vehicles in its way
     cost: jax.Array  # [ny, nx] per metre, inf where no wheel can stand
     moves: jax.Array  # [16, ny, nx] cost of each move, inf where the rover does not fit
     origin_m: jax.Array  # [2] centre of cell [0, 0], world
@@ -65,8 +70,8 @@ class RouteGrid:
         inside = jnp.all((around >= 0) & (around < jnp.array(self.cost.shape)), axis=-1)
         around = jnp.clip(around, 0, jnp.array(self.cost.shape) - 1)
         centre = self.place(around)
-        wanted = jnp.minimum(self.radius_m, sample(self.site.clearance_m, self.site, xy) - NEARER_M)
-        way = line_clearance(self.site, jnp.broadcast_to(xy, centre.shape), centre, ENTRY_SAMPLES)
+        wanted = jnp.minimum(self.radius_m, clearance_at(self.site, self.standing_m, xy) - NEARER_M)
+        way = line_clearance(self.site, self.standing_m, jnp.broadcast_to(xy, centre.shape), centre, ENTRY_SAMPLES)
         leaves = jnp.any(jnp.isfinite(self.moves[:, around[:, 0], around[:, 1]]), axis=0)
         good = inside & leaves & (way >= jnp.maximum(wanted, CLEAR_MIN_M))
         apart = jnp.where(good, jnp.sum((centre - xy) ** 2, axis=-1), jnp.inf)
@@ -89,6 +94,7 @@ class RoverLimits:
     slope_max: jax.Array  # [M] rise per metre
     step_max_m: jax.Array  # [M]
     acceleration_m_s2: jax.Array  # [M] of its paths
+    standing_m: jax.Array  # [M, V, 3] east, north and radius of multirotors that land in its way
 
 
 def rover_limits(assignment: Assignment) -> RoverLimits:
@@ -100,7 +106,19 @@ def rover_limits(assignment: Assignment) -> RoverLimits:
         slope_max=on_host([math.tan(math.radians(spec.slope_max_deg)) for spec in rovers]),
         step_max_m=on_host([spec.step_max_m for spec in rovers]),
         acceleration_m_s2=on_host([0.5 * spec.control.acceleration_max_m_s2 for spec in rovers]),
+        standing_m=on_host(_standing(assignment)),
     )
+
+
+def _standing(assignment: Assignment) -> NDArray[np.float64]:
+    """East, north and radius [M, V, 3] of the multirotors, which start and land beside each of M rovers (host)."""
+    scenario = assignment.scenario
+    places = [
+        (*member.position_m, spec.collision_radius_m + LANDED_M)
+        for member, spec in zip(scenario.members, scenario.vehicles, strict=True)
+        if isinstance(spec, Multirotor)
+    ]
+    return np.tile(np.array(places).reshape(-1, 3), (len(assignment.members), 1, 1))
 
 
 def route_grid(site: Site, limits: RoverLimits, block: int) -> RouteGrid:
@@ -116,19 +134,19 @@ def route_grid(site: Site, limits: RoverLimits, block: int) -> RouteGrid:
     east, north = jnp.meshgrid(jnp.arange(columns), jnp.arange(rows))
     centre = origin + cell * jnp.stack([east, north], axis=-1)
     fine_cells = block * max(1, site.clearance_m.shape[0] // site.terrain_m.shape[0])
-    fits = move_clearance(site, centre, cell, fine_cells) >= limits.radius_m
-    return RouteGrid(site, limits.radius_m, cost, move_costs(cost, fits, cell), origin, cell)
+    fits = move_clearance(site, limits.standing_m, centre, cell, fine_cells) >= limits.radius_m
+    return RouteGrid(site, limits.radius_m, limits.standing_m, cost, move_costs(cost, fits, cell), origin, cell)
 
 
 def ground_path(site: Site, corners_m: jax.Array, speed_m_s: jax.Array, limits: RoverLimits, points: int) -> Path:
     """Round the grid's corners [W, 2] where one rover has room for it, set the speeds, lay the path on the terrain."""
     flat, length = resample(corners_m, points)
     half_width = (SMOOTHING_M * (points - 1) / jnp.maximum(length, 1.0)).astype(jnp.int32)
-    wanted = jnp.minimum(limits.radius_m, sample(site.clearance_m, site, flat)) - CUT_M
+    wanted = jnp.minimum(limits.radius_m, clearance_at(site, limits.standing_m, flat)) - CUT_M
     rounded = flat
     for share in (4, 2, 1):  # the widest rounding that keeps clear
         wider = smooth(flat, half_width // share)
-        rounded = jnp.where((sample(site.clearance_m, site, wider) >= wanted)[:, None], wider, rounded)
+        rounded = jnp.where((clearance_at(site, limits.standing_m, wider) >= wanted)[:, None], wider, rounded)
     flat, length = resample(rounded, points)
     places = jnp.concatenate([flat, sample(site.terrain_m, site, flat)[:, None]], axis=-1)
     speed = limit_speed(places, jnp.full(points, speed_m_s), limits.acceleration_m_s2, CORNER_M)

@@ -43,19 +43,32 @@ def at_centres(raster: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return raster[factor // 2 :: factor, factor // 2 :: factor]
 
 
-def line_clearance(site: Site, start_m: jax.Array, end_m: jax.Array, samples: int) -> jax.Array:
-    """Least clearance [...] of a rover's centre on straight lines from ``start_m`` to ``end_m`` [..., 2]."""
+def clearance_at(site: Site, standing_m: jax.Array, xy: jax.Array) -> jax.Array:
+    """Clearance [...] of a rover's centre at places [..., 2]: to obstacles, and to what stands there [V, 3].
+
+    Of the latter east, north and a radius are given.
+    """
+    apart = jnp.linalg.norm(xy[..., None, :] - standing_m[:, :2], axis=-1) - standing_m[:, 2]
+    return jnp.minimum(sample(site.clearance_m, site, xy), jnp.min(apart, axis=-1, initial=jnp.inf))
+
+
+def line_clearance(
+    site: Site, standing_m: jax.Array, start_m: jax.Array, end_m: jax.Array, samples: int
+) -> jax.Array:  # fmt: skip
+    """Least `clearance_at` [...] on straight lines from ``start_m`` to ``end_m`` [..., 2]."""
     share = jnp.linspace(0.0, 1.0, samples)
 
     def closer(least: jax.Array, along: jax.Array) -> tuple[jax.Array, None]:
-        return jnp.minimum(least, sample(site.clearance_m, site, start_m + along * (end_m - start_m))), None
+        return jnp.minimum(least, clearance_at(site, standing_m, start_m + along * (end_m - start_m))), None
 
     shape = jnp.broadcast_shapes(start_m.shape, end_m.shape)[:-1]
     return jax.lax.scan(closer, jnp.full(shape, jnp.inf), share)[0]
 
 
-def move_clearance(site: Site, centre_m: jax.Array, cell_m: jax.Array, fine_cells: int) -> jax.Array:
-    """Least clearance [16, ny, nx] along each move from cells with centres ``centre_m`` [ny, nx, 2].
+def move_clearance(
+    site: Site, standing_m: jax.Array, centre_m: jax.Array, cell_m: jax.Array, fine_cells: int
+) -> jax.Array:  # fmt: skip
+    """Least `clearance_at` [16, ny, nx] along each move from cells with centres ``centre_m`` [ny, nx, 2].
 
     ``fine_cells`` cells of the raster of clearances lie along the edge ``cell_m`` [] of a cell.
     """
@@ -68,7 +81,7 @@ def move_clearance(site: Site, centre_m: jax.Array, cell_m: jax.Array, fine_cell
         else:
             samples = max(2, math.ceil(fine_cells * math.hypot(row, column) / SAMPLE_CELLS)) + 1
             end = centre_m + cell_m * jnp.array([column, row], jnp.float32)
-            found[row, column] = line_clearance(site, centre_m, end, samples)
+            found[row, column] = line_clearance(site, standing_m, centre_m, end, samples)
     return jnp.stack(list(found.values()))
 
 

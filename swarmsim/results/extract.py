@@ -11,7 +11,7 @@ from swarmsim.missions.state import MissionState
 from swarmsim.radiation.dose import gamma_constant
 from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.radiation.rate import highest_rate
-from swarmsim.results.finding import finding
+from swarmsim.results.finding import NO_SPECTRUM, NO_WAY, finding
 from swarmsim.results.record import (
     Estimate,
     Event,
@@ -32,6 +32,7 @@ from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.site.model import height_at
 from swarmsim.world.build import detector_models
+from swarmsim.world.events import KINDS
 
 LEAST_STD_M, LEAST_STD_SHARE = 0.01, 0.002
 """Errors that no statistics tell of: of a measured position and of a detector's constants, even ideal ones."""
@@ -65,6 +66,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     verdict = None
     if conclusion is not None and chart is not None:
         verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, spectrum)
+    events = sorted(_events(simulation, end, phases), key=lambda event: event.time_s)
     return MissionRecord(
         name=simulation.scenario.mission.name,
         site=simulation.site_model.name,
@@ -82,8 +84,8 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         spectrum=spectrum,
         sources=sources,
         paths_m=_paths(simulation, end),
-        events=tuple(sorted(_events(simulation, end, phases), key=lambda event: event.time_s)),
-        finding=finding(verdict, final, spectrum, _no_way(simulation, end), _one_nuclide(simulation)),
+        events=tuple(events),
+        finding=finding(verdict, final, spectrum, _hindrance(simulation, end, events), _one_nuclide(simulation)),
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
         warnings=(CROWDED,) if bool(end.world.crowded) else (),
@@ -288,6 +290,21 @@ def _surveyed_s(simulation: Simulation, end: MissionState) -> float:
         if phase.target == "source" and np.isfinite(state.asked_s)
     ]
     return max(asked, default=float(end.over_s))
+
+
+def _hindrance(simulation: Simulation, end: MissionState, events: list[Event]) -> str | None:
+    """What kept rovers from the source: no drivable way there, or what happened to the first of them that was lost."""
+    if _no_way(simulation, end):
+        return NO_WAY
+    scenario = simulation.scenario
+    sent = {
+        scenario.members[number].name
+        for phase, members in zip(simulation.plan.phases, scenario.phase_members, strict=True)
+        if phase.target == "source"
+        for number in members
+    }
+    lost = [event for event in events if event.kind in KINDS and event.vehicle in sent]
+    return f"{NO_SPECTRUM} ({lost[0].vehicle}: {lost[0].detail})" if lost else None
 
 
 def _no_way(simulation: Simulation, end: MissionState) -> bool:

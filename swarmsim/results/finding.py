@@ -8,12 +8,18 @@ from swarmsim.results.status import CONFIRMED, Verdict, in_mbq
 
 NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"
+NO_WAY = "no drivable way for the rover to reach it"
+NO_SPECTRUM = "no spectrum was taken near it"
 BAD_FIT = 1e-3
 """p-value below which the finding says that the named nuclide does not fit the spectrum."""
 
 
 def finding(
-    verdict: Verdict | None, final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, presumed: bool
+    verdict: Verdict | None,
+    final: tuple[Estimate, ...],
+    spectrum: Spectrum | None,
+    hindrance: str | None,
+    presumed: bool,
 ) -> str:
     """What was found, and why it is not to be believed where it is not.
 
@@ -21,22 +27,22 @@ def finding(
         verdict: on the answer; None where no source was sought.
         final: sources by all counts, the surest first.
         spectrum: taken near the surest one; None where none was.
-        no_way: whether no rover had a drivable way to it.
+        hindrance: what kept rovers from it, as far as known.
         presumed: whether one nuclide alone is in question.
     """
     by = "nuclide presumed" if presumed else "nuclide by the counts"
     if verdict is None:
         return NOTHING_SOUGHT
-    found = _found(final, spectrum, no_way, by)
+    found = _found(final, spectrum, hindrance, by)
     if not verdict.reasons:
         return found
     return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
 
 
-def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, no_way: bool, by: str) -> str:
+def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, hindrance: str | None, by: str) -> str:
     if not final:
         return NOTHING_FOUND
-    first = _surest(final[0], spectrum, no_way, by) + _besides(final, spectrum)
+    first = _surest(final[0], spectrum, hindrance, by) + _besides(final, spectrum)
     if len(final) == 1:
         return f"a source of {first}"
     others = "; ".join(f"of {_placed(one)}" for one in final[1:])
@@ -54,12 +60,10 @@ def _placed(estimate: Estimate) -> str:
     return f"{placed} ({another} would be noticed from {in_mbq(estimate.beside_mbq)} on)"
 
 
-def _surest(estimate: Estimate, spectrum: Spectrum | None, no_way: bool, by: str) -> str:
+def _surest(estimate: Estimate, spectrum: Spectrum | None, hindrance: str | None, by: str) -> str:
     place = _placed(estimate)
-    if no_way:
-        return f"{place}; {by}, no drivable way for the rover to reach it"
-    if spectrum is None:
-        return f"{place}; {by}, no spectrum was taken near it"
+    if spectrum is None or hindrance == NO_WAY:
+        return f"{place}; {by}, {hindrance or NO_SPECTRUM}"
     return f"{place}; {_identified(estimate, spectrum, by)}"
 
 

@@ -1,11 +1,13 @@
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmsim.policies.ground_path import RoverLimits
+import swarmsim
+from swarmsim.policies.ground_path import LANDED_M, RoverLimits, rover_limits
 from swarmsim.policies.ground_search import ApproachAndOrbit, SearchTask
 from swarmsim.policies.routes import MOVES, coarsen, cost_to_go, descend, move_costs, smooth
 from swarmsim.site import Steps
@@ -19,12 +21,13 @@ plan = jax.jit(planner.plan)
 TARGET = (10.0, 4.0)
 
 
-def make_task(rovers=1, standoff=4.0, viewpoints=8, radius=0.6, laps=1, slope_max=0.36, step_max=0.12):
+def make_task(rovers=1, standoff=4.0, viewpoints=8, radius=0.6, laps=1, slope_max=0.36, step_max=0.12, standing=()):
     limits = RoverLimits(
         radius_m=jnp.full(rovers, radius),
         slope_max=jnp.full(rovers, slope_max),
         step_max_m=jnp.full(rovers, step_max),
         acceleration_m_s2=jnp.full(rovers, 0.5),
+        standing_m=jnp.broadcast_to(jnp.reshape(jnp.array(standing, jnp.float32), (-1, 3)), (rovers, len(standing), 3)),
     )
     return SearchTask(
         standoff_m=jnp.float32(standoff),
@@ -70,6 +73,41 @@ def test_no_move_leads_across_a_wall_of_one_cell(slanted):
     assert tuple(route[-1]) == (30, 36)
     assert route[:, 0].min() <= 4
     assert np.isfinite(cost[route[:, 0], route[:, 1]]).all()
+
+
+def test_a_route_leads_round_vehicles_that_stand_on_it():
+    start, size = (-30.0, 4.0), 0.9
+    places = (np.array([[-10.0, 3.8], [20.0, 30.0]]), np.array([[-10.0, 3.8], [10.0, 8.0]]))
+    straight = np.asarray(drive(start, TARGET, block_site([])).points_m)[:, :2]
+    for standing in places:
+        given = [(*place, size) for place in standing]
+        points = np.asarray(drive(start, TARGET, block_site([]), standing=given).points_m)[:, :2]
+        apart = np.linalg.norm(points[:, None] - standing, axis=-1).min(axis=0)
+        assert (apart >= size + 0.6 - 0.2).all()
+        assert np.linalg.norm(straight - standing[0], axis=-1).min() < 0.5
+        length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+        assert length < 1.05 * np.linalg.norm(np.diff(straight, axis=0), axis=1).sum() + 2.0
+
+
+def test_a_rover_leaves_from_beside_a_vehicle_and_has_no_way_where_these_enclose_it():
+    beside = np.asarray(drive((-30.0, 4.0), TARGET, block_site([]), standing=[(-28.8, 4.0, 0.9)]).points_m)[:, :2]
+    np.testing.assert_allclose(beside[0], [-30.0, 4.0], atol=1e-3)
+    assert np.linalg.norm(beside - [-28.8, 4.0], axis=-1).min() > 1.1
+    assert np.linalg.norm(beside - TARGET, axis=-1).min() < 6.0
+    ring = [(-30.0 + 4.0 * np.cos(a), 4.0 + 4.0 * np.sin(a), 1.0) for a in np.linspace(0.0, 2.0 * np.pi, 13)[:-1]]
+    assert float(drive((-30.0, 4.0), TARGET, block_site([]), standing=ring).length_m) < 1e-3
+
+
+def test_multirotors_stand_in_the_way_of_rovers():
+    scenario = swarmsim.load("recon", [])
+    rover = next(i for i, member in enumerate(scenario.members) if member.name == "orpheus")
+    standing = np.asarray(rover_limits(SimpleNamespace(scenario=scenario, members=(rover,))).standing_m)
+    expected = [
+        [*member.position_m, spec.collision_radius_m + LANDED_M]
+        for member, spec in zip(scenario.members, scenario.vehicles, strict=True)
+        if spec.kind == "multirotor"
+    ]
+    np.testing.assert_allclose(standing, [expected], rtol=1e-6)
 
 
 def test_enclosed_goal_is_unreachable():

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmsim.results.finding import NOTHING_FOUND, NOTHING_SOUGHT, finding
+from swarmsim.results.finding import NO_WAY, NOTHING_FOUND, NOTHING_SOUGHT, finding
 from swarmsim.results.record import Spectrum
 from swarmsim.results.status import Verdict
 from tests.results.test_status import estimate
@@ -23,69 +23,72 @@ def spectrum(nuclide: str, goodness: float = 0.4) -> Spectrum:
 
 
 def test_nothing_sought_and_nothing_found():
-    assert finding(None, (), None, no_way=False, presumed=False) == NOTHING_SOUGHT
-    assert finding(replace(SURE, status="none"), (), None, no_way=False, presumed=False) == NOTHING_FOUND
+    assert finding(None, (), None, hindrance=None, presumed=False) == NOTHING_SOUGHT
+    assert finding(replace(SURE, status="none"), (), None, hindrance=None, presumed=False) == NOTHING_FOUND
 
 
 @pytest.mark.parametrize(("presumed", "said"), [(True, "nuclide presumed"), (False, "nuclide by the counts")])
 def test_it_says_where_the_nuclide_is_from(presumed, said):
-    assert f"; {said}, no spectrum" in finding(SURE, ONE, None, no_way=False, presumed=presumed)
-    assert f"; {said}, no drivable way" in finding(SURE, ONE, None, no_way=True, presumed=presumed)
-    assert f"; {said}, the spectrum suggests Zn-65 with 97%" in finding(SURE, ONE, spectrum("Zn-65"), False, presumed)
-    assert f"; {said}, the spectrum shows none" in finding(SURE, ONE, spectrum("none"), False, presumed)
+    assert f"; {said}, no spectrum" in finding(SURE, ONE, None, hindrance=None, presumed=presumed)
+    lost = "no spectrum was taken near it (orpheus: collided with another vehicle)"
+    assert f"; {said}, {lost}" in finding(SURE, ONE, None, hindrance=lost, presumed=presumed)
+    assert "orpheus" not in finding(SURE, ONE, spectrum("Co-60"), hindrance=lost, presumed=presumed)
+    assert f"; {said}, no drivable way" in finding(SURE, ONE, None, hindrance=NO_WAY, presumed=presumed)
+    assert f"; {said}, the spectrum suggests Zn-65 with 97%" in finding(SURE, ONE, spectrum("Zn-65"), None, presumed)
+    assert f"; {said}, the spectrum shows none" in finding(SURE, ONE, spectrum("none"), None, presumed)
     assert f"; {said}, the spectrum is of none in the library" in finding(
-        SURE, ONE, spectrum("unknown"), False, presumed
+        SURE, ONE, spectrum("unknown"), None, presumed
     )
 
 
 def test_a_spectrum_that_names_it_says_how_well():
     named = ONE[0].nuclide
-    assert finding(SURE, ONE, spectrum(named), False, False).endswith("; identified with 97.0%")
-    assert "fits the spectrum badly (p = 1e-05)" in finding(SURE, ONE, spectrum(named, 1e-5), False, False)
+    assert finding(SURE, ONE, spectrum(named), None, False).endswith("; identified with 97.0%")
+    assert "fits the spectrum badly (p = 1e-05)" in finding(SURE, ONE, spectrum(named, 1e-5), None, False)
 
 
 def test_it_says_what_the_spectrum_shows_besides():
     also = replace(spectrum("Co-60"), scores={"Co-60": 0.97, "I-131": 0.95, "Cs-137": 0.5, "Na-22": 0.99})
     pair = (*ONE, estimate(30.0, nuclide="Na-22"))
     said = ", but the spectrum fits better with I-131 as well: a weak source, or walls other than presumed"
-    assert said in finding(SURE, pair, also, False, False)
-    assert "I-131 and Na-22 as well" in finding(SURE, ONE, also, False, False)
+    assert said in finding(SURE, pair, also, None, False)
+    assert "I-131 and Na-22 as well" in finding(SURE, ONE, also, None, False)
     told = replace(also, scores={"Co-60": 0.97, "Cs-137": 0.89})
-    assert "as well" not in finding(SURE, ONE, told, False, False)
-    assert "as well" not in finding(SURE, ONE, None, False, False)
+    assert "as well" not in finding(SURE, ONE, told, None, False)
+    assert "as well" not in finding(SURE, ONE, None, None, False)
 
 
 def test_a_source_that_may_be_several_is_told_so():
     joined = (replace(estimate(), joined_m=2.4),)
     assert "m (or several within 3 m, or behind other walls than presumed); " in finding(
-        SURE, joined, None, False, False
+        SURE, joined, None, None, False
     )
-    assert "several" not in finding(SURE, ONE, None, False, False)
+    assert "several" not in finding(SURE, ONE, None, None, False)
 
 
 def test_it_says_from_which_activity_on_another_source_beside_it_would_be_noticed():
-    said = finding(SURE, (replace(estimate(), beside_mbq=43.21),), None, False, False)
+    said = finding(SURE, (replace(estimate(), beside_mbq=43.21),), None, None, False)
     assert "(another Co-60 source 3 to 12 m off would be noticed from 43 MBq on); " in said
-    said = finding(SURE, ONE, None, False, False)
+    said = finding(SURE, ONE, None, None, False)
     assert "(another Co-60 source 3 to 12 m off may go unnoticed whatever its activity); " in said
     # where it may be several already, nothing more is said
-    assert "another" not in finding(SURE, (replace(estimate(), joined_m=2.4),), None, False, False)
+    assert "another" not in finding(SURE, (replace(estimate(), joined_m=2.4),), None, None, False)
 
 
 def test_certainty_is_never_stated():
     sure = replace(spectrum(ONE[0].nuclide), confidence=0.99999)
-    assert finding(SURE, ONE, sure, False, False).endswith("; identified with more than 99.9%")
+    assert finding(SURE, ONE, sure, None, False).endswith("; identified with more than 99.9%")
 
 
 def test_an_unknown_source_is_said_to_be_like_a_stranger():
     unknown = replace(spectrum("unknown"), alike="Sb-124")
-    assert finding(SURE, ONE, unknown, False, False).endswith("of none in the library with 97%, most like Sb-124")
+    assert finding(SURE, ONE, unknown, None, False).endswith("of none in the library with 97%, most like Sb-124")
 
 
 def test_several_sources_and_doubts_are_told():
     two = (estimate(), estimate(20.0, nuclide="Cs-137"))
     doubt = Verdict(status="ambiguous", reasons=("a", "b"), covered=1.0)
-    said = finding(doubt, two, None, no_way=False, presumed=False)
+    said = finding(doubt, two, None, hindrance=None, presumed=False)
     assert said.startswith("ambiguous: 2 sources: of ")
     assert "Cs-137 at (20.0" in said
     assert said.endswith("; but a; b")
@@ -94,4 +97,4 @@ def test_several_sources_and_doubts_are_told():
 def test_the_activity_of_a_faint_source_is_not_zero():
     for activity, said in ((0.0107, "0.011 MBq"), (9.96, "10 MBq"), (170.4, "170 MBq")):
         faint = (estimate(activity=activity),)
-        assert f"a source of {said} Co-60" in finding(SURE, faint, None, no_way=False, presumed=False)
+        assert f"a source of {said} Co-60" in finding(SURE, faint, None, hindrance=None, presumed=False)
