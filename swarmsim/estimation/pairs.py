@@ -222,13 +222,21 @@ def _along(problem: Problem, state: State, two: Two, reach_m: jax.Array) -> jax.
     share = jnp.mod((jnp.arange(PART - ALONG)[:, None] + 0.5) * jnp.array(_EVEN), 1.0)
     drawn = jax.scipy.special.ndtri(share) @ root.T * jnp.minimum(reach_m, FARTHEST * widest)
     drawn = drawn.at[0].set(step).reshape(-1, 2, 3)
-    over = [
+    sides = _other_side(problem, (two.place, second.place), (two.first.counts, counts))
+    return drawn.at[1 : 1 + sides.shape[0]].set(sides)
+
+
+def _other_side(
+    problem: Problem, places: tuple[jax.Array, jax.Array], counts: tuple[jax.Array, jax.Array]
+) -> jax.Array:
+    """Changes [4, 2, 3] that bring either of two to the other side of the way past it."""
+    first, second = (
         mirrored_place(problem, place, jnp.sum(seen, axis=1)) - place
-        for place, seen in ((two.place, two.first.counts), (second.place, counts))
-    ]
-    nothing = jnp.zeros(3)
-    sides = [jnp.stack(pair) * part for part in OVER for pair in ((over[0], nothing), (nothing, over[1]))]
-    return drawn.at[1 : 1 + len(sides)].set(jnp.stack(sides))
+        for place, seen in zip(places, counts, strict=True)
+    )
+    still = jnp.zeros(3)
+    over = jnp.stack([jnp.stack([first, still]), jnp.stack([still, second])])
+    return jnp.concatenate([over * part for part in OVER])
 
 
 def _in_one_place(count: int) -> jax.Array:

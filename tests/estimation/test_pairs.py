@@ -148,6 +148,26 @@ def test_two_nuclides_beside_one_another_are_sought_together(apart, off):
     np.testing.assert_allclose(found, [AT[:2], east(apart)[:2]], atol=0.3)
 
 
+@pytest.mark.parametrize("nuclides", [(0, 0), (0, 1)])
+def test_a_step_of_both_leads_from_beside_two_sources_to_them(nuclides):
+    """The counts are those expected: of two 6 m apart, both misplaced at right angles to one another."""
+    names = ["Co-60", "Cs-137"]
+    at = np.array([AT, east(6.0)])
+    truth = [(at[k], 200e6, names[kind]) for k, kind in enumerate(nuclides)]
+    off = np.array([[0.3, -0.1, 0.0], [0.1, 0.3, 0.0]])
+    given = [(place, 200e6) for place in at + off]
+    problem, state = state_of(truth, given, CERTAIN, nuclides=list(nuclides))
+    two = pairs._as_two(
+        problem, without(state, jnp.int32(1)), jnp.int32(0), jnp.int32(1), jnp.float32(1.0), jnp.int32(nuclides[1]),
+        jnp.asarray([[0.0, 0.0, 0.0], given[1][0] - given[0][0]], jnp.float32),
+    )  # fmt: skip
+    changes = np.asarray(pairs._along(problem, without(state, jnp.int32(1)), two, jnp.float32(2.0)))
+    left = np.linalg.norm((at + off + changes[0] - at)[:, :2], axis=1)
+    assert (left < 0.25 * np.linalg.norm(off, axis=1)).all()
+    # and those that are drawn spread about it
+    assert np.ptp(changes[5:, 0, :2], axis=0).min() > 0.01
+
+
 def test_a_height_that_is_known_is_not_left_for_two_nuclides():
     known = replace(KNOWN, height_m=jnp.float32(1.0), height_std_m=jnp.float32(0.05))
     truth = [(AT, 150e6), (AT, 200e6, "Cs-137")]
