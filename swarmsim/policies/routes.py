@@ -48,7 +48,9 @@ def clearance_at(site: Site, standing_m: jax.Array, xy: jax.Array) -> jax.Array:
 
     Of the latter east, north and a radius are given.
     """
-    apart = jnp.linalg.norm(xy[..., None, :] - standing_m[:, :2], axis=-1) - standing_m[:, 2]
+    # written out, so that the least is taken without an array of all: a swarm may stand there
+    east, north = (xy[..., None, axis] - standing_m[:, axis] for axis in (0, 1))
+    apart = jnp.sqrt(east * east + north * north) - standing_m[:, 2]
     return jnp.minimum(sample(site.clearance_m, site, xy), jnp.min(apart, axis=-1, initial=jnp.inf))
 
 
