@@ -20,18 +20,17 @@ from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.pairs import strain
 from swarmsim.estimation.posterior import of_others, posteriors
 from swarmsim.estimation.sources import SearchParams, find_sources
+from swarmsim.estimation.starts import Places, places_of
 from swarmsim.estimation.state import Sources, State, no_sources, ratios
 from swarmsim.pytree import on_host, pytree, static
 from swarmsim.radiation.coarse import coarse
 from swarmsim.radiation.detector import AIR, Detector
 from swarmsim.site import Site, sample
-from swarmsim.site.model import height_at
 
 TAIL = 4.0  # degrees of freedom of the error of a window's rate: a post between two rays takes a third of the counts
 LINES = 8  # of a nuclide, to which neighbours are put together
 WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
 BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known: half of it may be missing
-POINTS_MAX = 20_000  # of the grid of the first look
 CONVERGED_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
 NOTICED = 1.645  # standard deviations above what is asked of a further source: it has that with 95 % (ISO 11929)
@@ -56,7 +55,7 @@ class Presumed:
     sensitivity_std: jax.Array  # [] of ln(true over presumed sensitivity) of a detector
     ground_share: jax.Array  # [] of the nominal background, which falls with height
     nuclides: jax.Array  # [N] bool, in question
-    points_m: jax.Array  # [C, 3] where sources are looked for first, world
+    places: Places  # where sources are looked for first
     height_m: jax.Array  # [] prior of a source's height above ground
     height_std_m: jax.Array  # []
     uncertain: tuple[int, ...] = static()  # numbers of the U materials whose thickness is not known exactly
@@ -172,7 +171,7 @@ def presume(
         sensitivity_std=on_host(knowledge.sensitivity_std),
         ground_share=on_host(ground_share),
         nuclides=on_host(chosen, bool),
-        points_m=on_host(_grid(known, corners_m, spec.grid_m, spec.presumed_height_m)),
+        places=places_of(known, corners_m, spec.grid_m, spec.presumed_height_m),
         height_m=on_host(spec.presumed_height_m),
         height_std_m=on_host(spec.height_std_m),
         uncertain=uncertain,
@@ -201,15 +200,6 @@ def _materials_of(site: Site) -> list[int]:
     solid = np.asarray(site.obstacles.half_extent_m)[:, 0] > 0.0
     used = set(np.asarray(site.obstacles.material)[solid].tolist()) | {int(site.ground_material)}
     return sorted(used | {site.material_names.index(AIR)})
-
-
-def _grid(site: Site, corners_m: np.ndarray, step_m: float, height_m: float) -> np.ndarray:
-    """Points [C, 3] over the area, ``step_m`` apart, farther where there would be too many."""
-    low, high = np.min(corners_m, axis=0), np.max(corners_m, axis=0)
-    step = max(step_m, float(np.sqrt(np.prod(high - low) / POINTS_MAX)))
-    axes = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True)]
-    xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return np.column_stack([xy, height_at(site, xy) + height_m])
 
 
 def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span, ...]) -> Problem:
@@ -265,7 +255,7 @@ def localise(
         known: an earlier estimate's state, to go on from; zeros say nothing.
     """
     problem = problem_of(presumed, measurements, spans)
-    points, nuclides = jnp.asarray(presumed.points_m), jnp.asarray(presumed.nuclides)
+    nuclides = jnp.asarray(presumed.nuclides)
     state = no_sources(problem, params.search.sources_max, nuclides.shape[0])
     if known is not None:
         # the windows are others now
@@ -275,7 +265,7 @@ def localise(
             sources=replace(known.sources, place=jnp.where(there, known.sources.place, state.sources.place)),
             unknowns=replace(state.unknowns, level=known.unknowns.level, lengths=known.unknowns.lengths),
         )
-    state = find_sources(problem, points, nuclides, params.search, state)
+    state = find_sources(problem, presumed.places, nuclides, params.search, state)
     return _report(presumed, problem, params, state)
 
 

@@ -17,20 +17,19 @@ from swarmsim.estimation.forward import Problem, Rates, variance_of
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.normal_equations import Others
 from swarmsim.estimation.pairs import are_mixed, divided, divisible, joined, strain
-from swarmsim.estimation.scan import scan, strongest
 from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
+from swarmsim.estimation.starts import STARTS, Places, Starts, no_starts, starts_of
 from swarmsim.estimation.state import State, ratios, settled, shared, signals, without
 from swarmsim.pytree import pytree, static
 
 PART = 12  # candidates in each part of a round, at least
-STARTS = 8  # grid points that are tried for a further source
-BEGINNINGS = STARTS // FITTED  # rounds that try them
+INSIDE = 1  # rounds that try places in buildings
+BEGINNINGS = INSIDE + STARTS // FITTED  # and points of the grid
 AROUND = 1.5  # how far around a grid point, over the distance from one to the next
 REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; nuclides are compared in the second
 CLOSING = 0.55  # reach of a later round over that of the one before
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
 HOPELESS = 0.4  # of the threshold: the ratio at the best of some starts below which no further round is worth while
-APART_M = 12.0  # between starts
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
@@ -58,14 +57,6 @@ class SearchParams:
 
 
 @pytree
-class Starts:
-    """Grid points that are tried for a further source."""
-
-    point_m: jax.Array  # [S, 3] world
-    nuclide: jax.Array  # [S] int32 that explains most there
-
-
-@pytree
 class _Progress:
     """How far the search is."""
 
@@ -82,9 +73,7 @@ class _Progress:
     closing: jax.Array  # [] bool, whether companions have been joined: no more sources are added
 
 
-def find_sources(
-    problem: Problem, points_m: jax.Array, allowed: jax.Array, params: SearchParams, state: State
-) -> State:
+def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: SearchParams, state: State) -> State:
     """Seek the sources of ``state`` again, then add others until no further one explains the counts beyond chance.
 
     After each that is added the others are sought again. Then the one that is missed least is left out for a trial: the
@@ -94,7 +83,7 @@ def find_sources(
 
     Args:
         problem: the data.
-        points_m: [C, 3] grid of the first look, world.
+        places: where a source is looked for first.
         allowed: [N] bool, nuclides in question.
         params: settings.
         state: what is known already (`no_sources`).
@@ -114,7 +103,7 @@ def find_sources(
     def step(p: _Progress) -> _Progress:
         adding = ~jnp.any(p.again)
         slot = jnp.where(adding, jnp.argmin(p.state.sources.present), jnp.argmax(p.again))
-        state, found = _sought(problem, points_m, allowed, params, p.state, slot, adding, p.wide)
+        state, found = _sought(problem, places, allowed, params, p.state, slot, adding, p.wide)
         present = state.sources.present
         mine = jnp.arange(present.shape[0]) == slot
         again = jnp.where(adding & found, present, p.again) & ~mine
@@ -223,7 +212,7 @@ def _divisions(p: _Progress, removed: jax.Array) -> jax.Array:
 
 def _sought(
     problem: Problem,
-    points_m: jax.Array,
+    places: Places,
     allowed: jax.Array,
     params: SearchParams,
     state: State,
@@ -235,13 +224,11 @@ def _sought(
     s = state.sources
     others = without(state, slot).added
 
-    def first_look() -> tuple[Starts, jax.Array]:
-        scanned = scan(problem, points_m, allowed, others, state.unknowns)
-        index, statistic = strongest(scanned, points_m, STARTS, APART_M)
-        return Starts(point_m=points_m[index], nuclide=scanned.nuclide[index]), statistic[0]
-
-    nothing = Starts(point_m=jnp.zeros((STARTS, 3)), nuclide=jnp.zeros(STARTS, jnp.int32))
-    starts, statistic = for_those(adding | wide, first_look, lambda: (nothing, jnp.zeros(())))
+    starts, statistic = for_those(
+        adding | wide,
+        lambda: starts_of(problem, places, allowed, others, state.unknowns),
+        lambda: (no_starts(places), jnp.zeros(())),
+    )
 
     def look() -> tuple[State, jax.Array]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
@@ -276,21 +263,31 @@ def _best(
     closing = CLOSING ** jnp.arange(1, params.rounds + 1)
     reaches = params.reach_m * jnp.concatenate([jnp.ones(BEGINNINGS), jnp.array(REACHES), closing])
     naming, closer = BEGINNINGS + 1, BEGINNINGS + len(REACHES)
-    first = jnp.where(adding | wide, 0, closer)
+    outdoors = INSIDE - jnp.minimum(-(-jnp.sum(starts.there) // size), INSIDE)
+    first = jnp.where(adding | wide, outdoors, closer)
     s = state.sources
     yes, no = jnp.ones(size, bool), jnp.zeros(size, bool)
     up_m = 1.5 * problem.height_std_m
 
     def begin(best: Tried, number: jax.Array) -> Candidates:
-        index = FITTED * jnp.minimum(number, BEGINNINGS - 1) + jnp.arange(FITTED)
+        index = FITTED * jnp.clip(number - INSIDE, 0, BEGINNINGS - INSIDE - 1) + jnp.arange(FITTED)
         centre = jnp.concatenate([starts.point_m[index, :2], jnp.broadcast_to(problem.height_m, (FITTED, 1))], axis=1)
         around = jax.vmap(lambda c: spread(c, AROUND * params.grid_m, up_m, size // FITTED, number))(centre)
         nuclides = jnp.repeat(starts.nuclide[index], size // FITTED)
         # where a source was found before is the first candidate
-        known_one = ~adding & (number == 0) & (jnp.arange(size) == 0)
+        known_one = ~adding & (number == INSIDE) & (jnp.arange(size) == 0)
         places = jnp.where(known_one[:, None], s.place[slot], around.reshape(-1, 3))
         nuclides = jnp.where(known_one, s.nuclide[slot], nuclides)
-        return Candidates(place=places, nuclide=nuclides, allowed=yes, sure=known_one, apart=yes[0])
+        indoors = number < INSIDE
+        room = jnp.minimum(size * jnp.minimum(number, INSIDE - 1) + jnp.arange(size), starts.there.shape[0] - 1)
+        inside = jnp.concatenate([starts.inside_m[room], jnp.broadcast_to(problem.height_m, (size, 1))], axis=1)
+        return Candidates(
+            place=jnp.where(indoors, inside, places),
+            nuclide=jnp.where(indoors, starts.inside_nuclide[room], nuclides),
+            allowed=~indoors | starts.there[room],
+            sure=known_one,
+            apart=~indoors,
+        )
 
     def name(best: Tried, number: jax.Array) -> Candidates:
         everyone = jnp.arange(size, dtype=jnp.int32)

@@ -11,8 +11,9 @@ from swarmsim.config.scenario import Scenario
 from swarmsim.config.site_ground import Ground
 from swarmsim.config.start_checks import OVERHEAD_M
 from swarmsim.config.vary import PlaceIn, Region
-from swarmsim.site.model import SiteModel, height_at
+from swarmsim.site.model import SiteModel
 from swarmsim.site.raster import in_polygon
+from swarmsim.site.rooms import Rooms, rooms_of
 
 Floats = NDArray[np.float64]
 Numbers = Callable[[int], Floats]
@@ -74,8 +75,8 @@ class Regions:
     def _proposal(self, region: Region, place: PlaceIn, height_m: float) -> Callable[[Floats], Floats] | None:
         """What makes places [n, 2], uniform over a part of the site that holds the region, of numbers [3, n]."""
         if region == "indoors":
-            rooms = self._rooms(place)
-            return partial(self._in_rooms, rooms, place) if len(rooms) else None
+            rooms = rooms_of(self._site, place.margin_m)
+            return partial(_in_rooms, rooms) if len(rooms.box) else None
         key = (region == "behind_walls", place.near_m if region == "behind_walls" else region != "anywhere")
         if (cells := self._cells.get(key)) is None:
             of = self._near_walls(place.near_m) if region == "behind_walls" else self._cells_of(region != "anywhere")
@@ -86,24 +87,6 @@ class Regions:
         """Places [n, 2] in cells [c, 2] (column, row)."""
         corner = cells[(numbers[0] * len(cells)).astype(int)]
         made: Floats = self._ground.low + self._ground.cell * (corner + numbers[1:].T)
-        return made
-
-    def _rooms(self, place: PlaceIn) -> NDArray[np.int64]:
-        """Hollow boxes with room for the margin, and a cavity that reaches to the ground."""
-        ground = self._ground
-        inner = ground.half - ground.wall[:, None]
-        room = np.all(inner[:, :2] > place.margin_m, axis=1) & (inner[:, 2] > 0) & (ground.wall > 0)
-        floor = ground.centre[:, 2] - inner[:, 2]
-        under = height_at(self._site, ground.centre[:, :2])
-        return np.flatnonzero(room & (floor < under + RISES_M))
-
-    def _in_rooms(self, rooms: NDArray[np.int64], place: PlaceIn, numbers: Floats) -> Floats:
-        """Places [n, 2] in hollow boxes, each box as likely."""
-        ground = self._ground
-        box = rooms[(numbers[0] * len(rooms)).astype(int)]
-        reach = ground.half[box, :2] - ground.wall[box, None] - place.margin_m
-        (along, across), (c, s) = reach.T * (2.0 * numbers[1:] - 1.0), ground.axis[box].T
-        made: Floats = ground.centre[box, :2] + np.stack([c * along - s * across, s * along + c * across], axis=1)
         return made
 
     def _possible(self, place: PlaceIn, points: Floats) -> NDArray[np.bool_]:
@@ -194,3 +177,11 @@ class Regions:
             along, across = offset @ ground.axis[k], offset @ np.array([-ground.axis[k, 1], ground.axis[k, 0]])
             near |= (np.abs(along) <= ground.half[k, 0] + reach) & (np.abs(across) <= ground.half[k, 1] + reach)
         return cells[near]
+
+
+def _in_rooms(rooms: Rooms, numbers: Floats) -> Floats:
+    """Places [n, 2] in hollow boxes, each box as likely."""
+    room = (numbers[0] * len(rooms.box)).astype(int)
+    (along, across), (c, s) = rooms.reach_m[room].T * (2.0 * numbers[1:] - 1.0), rooms.axis[room].T
+    made: Floats = rooms.centre_m[room, :2] + np.stack([c * along - s * across, s * along + c * across], axis=1)
+    return made

@@ -308,13 +308,12 @@ def test_what_is_known_of_another_source_beside_one_is_the_information_about_bot
 def test_what_is_sought_again_does_not_go_where_it_explains_less(monkeypatch):
     problem, state = state_of([(AT, ACTIVITY)], seed=1)
     no, allowed = jnp.array(False), jnp.ones(len(NUCLIDES), bool)
-    points = jnp.asarray(KNOWN.points_m)[:4]
     for loss, stays in ((100.0, True), (-1.0, False)):
         tried = as_known(problem, state, jnp.int32(0), no)
         fit = replace(tried.fit, likelihood=state.likelihood - loss)
         elsewhere = replace(tried, place=tried.place + 3.0, fit=fit)
         monkeypatch.setattr(sources, "_best", lambda *_, found=elsewhere: (found, jnp.zeros(len(NUCLIDES))))
-        after, _ = sources._sought(problem, points, allowed, PARAMS.search, state, jnp.int32(0), no, no)
+        after, _ = sources._sought(problem, KNOWN.places, allowed, PARAMS.search, state, jnp.int32(0), no, no)
         assert bool(jnp.allclose(after.sources.place[0], tried.place)) == stays
 
 

@@ -1,0 +1,119 @@
+"""Where sources are looked for first: the points of a grid that are most promising in the open air, and in buildings.
+
+Walls of a building hide a source from one side and let it through on another, so that the open air's statistic
+(`swarmsim.estimation.scan`) may be largest metres away, and the building it lies in not be among the best. So places in
+all hollow boxes are looked at besides, with rays.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from swarmsim.estimation.forward import Problem
+from swarmsim.estimation.normal_equations import Others, Unknowns
+from swarmsim.estimation.scan import scan, strongest
+from swarmsim.pytree import on_host, pytree
+from swarmsim.site import Site
+from swarmsim.site.model import height_at
+from swarmsim.site.rooms import rooms_of
+
+STARTS = 8  # grid points that are tried for a further source
+APART_M = 12.0  # between those
+POINTS_MAX = 20_000  # of the grid
+INSIDE_MAX = 960  # places in buildings
+INSIDE = 96  # their number is a multiple of this, so that few sites differ in it
+FROM_WALLS_M = 0.3
+
+
+@pytree
+class Places:
+    """Where sources are looked for first, by the area and the site."""
+
+    points_m: jax.Array  # [C, 3] grid over the area, world
+    inside_m: jax.Array  # [I, 2] in hollow boxes, world
+    near: jax.Array  # [I] int32 the nearest point of the grid
+    there: jax.Array  # [I] bool, whether it is a place: the rest fills the array up
+
+
+@pytree
+class Starts:
+    """What is tried for a further source: S grid points and I places in buildings."""
+
+    point_m: jax.Array  # [S, 3] world
+    nuclide: jax.Array  # [S] int32 that explains most there
+    inside_m: jax.Array  # [I, 2] world, the most promising first
+    inside_nuclide: jax.Array  # [I] int32
+    there: jax.Array  # [I] bool
+
+
+def places_of(site: Site, corners_m: np.ndarray, step_m: float, height_m: float) -> Places:
+    """The places ``height_m`` above the ground of an area with those corners [V, 2] (host).
+
+    Points of the grid lie ``step_m`` apart, farther where there would be too many, and so do those in a building.
+    """
+    low, high = np.min(corners_m, axis=0), np.max(corners_m, axis=0)
+    step = max(step_m, float(np.sqrt(np.prod(high - low) / POINTS_MAX)))
+    axes = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True)]
+    xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    inside = _inside(site, low - step, high + step, step)
+    # what fills the array up is a point of the grid
+    fill = -len(inside) % INSIDE if len(inside) else INSIDE
+    there = np.arange(len(inside) + fill) < len(inside)
+    inside = np.concatenate([inside, np.tile(xy[:1], (fill, 1))])
+    near = [np.argmin(np.sum(np.square(xy - one), axis=1)) for one in inside]
+    return Places(
+        points_m=on_host(np.column_stack([xy, height_at(site, xy) + height_m])),
+        inside_m=on_host(inside),
+        near=on_host(near, np.int32),
+        there=on_host(there, bool),
+    )
+
+
+def _inside(site: Site, low: np.ndarray, high: np.ndarray, step_m: float) -> np.ndarray:
+    """Places [I, 2] in the hollow boxes between ``low`` and ``high`` [2]: the fewest that are ``step_m`` apart."""
+    rooms = rooms_of(site, FROM_WALLS_M)
+    step = step_m
+    while True:
+        parts = np.maximum(np.ceil(2.0 * rooms.reach_m / step), 1).astype(int)
+        if np.sum(np.prod(parts, axis=1)) <= INSIDE_MAX or np.all(parts == 1):
+            break
+        step *= 1.25
+    made = [np.zeros((0, 2))]
+    for centre, reach, axis, (along, across) in zip(rooms.centre_m, rooms.reach_m, rooms.axis, parts, strict=True):
+        shares = np.meshgrid((2 * np.arange(along) + 1) / along - 1, (2 * np.arange(across) + 1) / across - 1)
+        one, other = (reach[k] * shares[k].ravel() for k in range(2))
+        turned = np.stack([axis[0] * one - axis[1] * other, axis[1] * one + axis[0] * other], axis=1)
+        made.append(centre[:2] + turned)
+    every = np.concatenate(made)
+    return every[np.all((every >= low) & (every <= high), axis=1)][:INSIDE_MAX]
+
+
+def starts_of(
+    problem: Problem, places: Places, allowed: jax.Array, others: Others, u: Unknowns
+) -> tuple[Starts, jax.Array]:  # fmt: skip
+    """What is tried for a source beside ``others``, and the largest statistic; ``u`` is the fit with them alone.
+
+    ``allowed`` [N] are the nuclides in question. A place in a building is tried with the nuclide that explains most at
+    the nearest point of the grid.
+    """
+    scanned = scan(problem, places.points_m, allowed, others, u)
+    index, statistic = strongest(scanned, places.points_m, STARTS, APART_M)
+    near = jnp.asarray(places.near)
+    order = jnp.argsort(jnp.where(places.there, -scanned.statistic[near], jnp.inf))
+    starts = Starts(
+        point_m=jnp.asarray(places.points_m)[index],
+        nuclide=scanned.nuclide[index],
+        inside_m=jnp.asarray(places.inside_m)[order],
+        inside_nuclide=scanned.nuclide[near[order]],
+        there=jnp.asarray(places.there)[order],
+    )
+    return starts, statistic[0]
+
+
+def no_starts(places: Places) -> Starts:
+    """Of a search that begins where the source is."""
+    count = places.there.shape[0]
+    return Starts(
+        point_m=jnp.zeros((STARTS, 3)), nuclide=jnp.zeros(STARTS, jnp.int32),
+        inside_m=jnp.zeros((count, 2)), inside_nuclide=jnp.zeros(count, jnp.int32), there=jnp.zeros(count, bool),
+    )  # fmt: skip

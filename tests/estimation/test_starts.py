@@ -1,0 +1,67 @@
+"""Where sources are looked for first."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarmsim.estimation.starts import INSIDE, INSIDE_MAX, places_of
+from tests.estimation.survey import place
+
+CORNERS = 70.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def site_of(boxes, wall=0.3, axis=(1.0, 0.0)):
+    """A plane with hollow boxes of (x, y), (half length, half width)."""
+    site = place([((x, y, 2.5), (length, width, 2.5), "concrete") for (x, y), (length, width) in boxes])
+    hollow, turned = jnp.full(len(boxes), wall), jnp.tile(jnp.array(axis), (len(boxes), 1))
+    return replace(site, obstacles=replace(site.obstacles, wall_m=hollow, axis=turned))
+
+
+@given(
+    x=st.floats(-40.0, 40.0), y=st.floats(-40.0, 40.0), length=st.floats(1.0, 20.0), width=st.floats(1.0, 20.0),
+    yaw=st.floats(0.0, 3.0),
+)  # fmt: skip
+def test_every_spot_of_a_building_is_near_a_place_in_it(x, y, length, width, yaw):
+    axis = np.array([np.cos(yaw), np.sin(yaw)])
+    places = places_of(site_of([((x, y), (length, width))], axis=axis), CORNERS, 4.0, 1.0)
+    there = places.there
+    offset = places.inside_m[there] - np.array([x, y])
+    own = np.stack([offset @ axis, offset @ np.array([-axis[1], axis[0]])], axis=1)
+    assert np.all(np.abs(own) < np.array([length, width]) - 0.3)
+    corner = np.array([length, width]) - 0.6
+    spots = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 2)) * np.maximum(corner, 0.0)
+    apart = np.linalg.norm(spots[:, None] - own, axis=2).min(axis=1)
+    assert np.all(apart < 2.0 * np.sqrt(2.0) + 1e-3)
+    assert len(there) % INSIDE == 0
+
+
+def test_the_nearest_point_of_the_grid_is_known():
+    places = places_of(site_of([((10.0, -20.0), (8.0, 5.0))]), CORNERS, 4.0, 1.0)
+    apart = np.linalg.norm(places.points_m[places.near[places.there], :2] - places.inside_m[places.there], axis=1)
+    assert np.all(apart < 2.0 * np.sqrt(2.0) + 0.1)
+
+
+def test_a_site_without_buildings_has_no_places_in_them():
+    places = places_of(place(), CORNERS, 4.0, 1.0)
+    assert places.there.shape == (INSIDE,)
+    assert not places.there.any()
+    assert np.isfinite(places.inside_m).all()
+
+
+def test_a_town_has_one_place_in_each_building_at_least():
+    side = np.arange(-65.0, 66.0, 5.0)
+    town = [((x, y), (2.2, 2.2)) for x in side for y in side]
+    places = places_of(site_of(town), CORNERS, 1.0, 1.0)
+    assert len(town) <= places.there.sum() <= INSIDE_MAX
+    inside = places.inside_m[places.there]
+    apart = np.linalg.norm(np.array([at for at, _ in town])[:, None] - inside, axis=2).min(axis=1)
+    assert np.all(apart < 2.2)
+
+
+@pytest.mark.parametrize("x", [120.0, -120.0])
+def test_a_building_outside_the_area_is_left_out(x):
+    assert not places_of(site_of([((x, 0.0), (8.0, 5.0))]), CORNERS, 4.0, 1.0).there.any()
