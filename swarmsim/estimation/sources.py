@@ -28,6 +28,7 @@ BEGINNINGS = INSIDE + STARTS // FITTED  # and points of the grid
 AROUND = 1.5  # how far around a grid point, over the distance from one to the next
 REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; nuclides are compared in the second
 CLOSING = 0.55  # reach of a later round over that of the one before
+NAMED_AGAIN = 3  # of those rounds, after which nuclides are compared again, where the source is known to a metre
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
 HOPELESS = 0.4  # of the threshold: the ratio at the best of some starts below which no further round is worth while
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
@@ -237,8 +238,7 @@ def _sought(
         least = jnp.where(jnp.any(s.present), params.further, params.threshold)
         found = ratio > jnp.where(adding, least, -HOPELESS * params.further)
         after = _with(problem, state, slot, best)
-        kept = jnp.where(adding | wide, values, s.nuclide_value[slot])
-        table = after.sources.nuclide_value.at[slot].set(kept)
+        table = after.sources.nuclide_value.at[slot].set(values)
         after = replace(after, sources=replace(after.sources, nuclide_value=table))
         return jax.tree.map(partial(jnp.where, found), after, state), found
 
@@ -260,9 +260,10 @@ def _best(
     """The best place from some grid points, or from where the source is, and the value of each nuclide [N]."""
     known = allowed.shape[0]
     size = FITTED * max(PART, -(-known // FITTED))
-    closing = CLOSING ** jnp.arange(1, params.rounds + 1)
-    reaches = params.reach_m * jnp.concatenate([jnp.ones(BEGINNINGS), jnp.array(REACHES), closing])
     naming, closer = BEGINNINGS + 1, BEGINNINGS + len(REACHES)
+    again = min(NAMED_AGAIN, params.rounds)
+    closing = CLOSING ** jnp.array([*range(1, again + 1), *range(again, params.rounds + 1)])
+    reaches = params.reach_m * jnp.concatenate([jnp.ones(BEGINNINGS), jnp.array(REACHES), closing])
     outdoors = INSIDE - jnp.minimum(-(-jnp.sum(starts.there) // size), INSIDE)
     first = jnp.where(adding | wide, outdoors, closer)
     s = state.sources
@@ -313,7 +314,7 @@ def _best(
 
     def round_(carry: tuple[jax.Array, Tried, jax.Array]) -> tuple[jax.Array, Tried, jax.Array]:
         number, best, table = carry
-        named = (number == naming) & (adding | wide)
+        named = ((number == naming) & (adding | wide)) | (number == closer + again)
         kind = jnp.where(number < BEGINNINGS, 0, jnp.where(named, 1, 2))
         candidates = switch(kind, [partial(kind_, best, number) for kind_ in (begin, name, around)])
         u = best.fit.unknowns
