@@ -57,6 +57,10 @@ class SearchParams:
     sources_max: int = static()
 
 
+_Rounds = tuple[jax.Array, Tried, jax.Array, jax.Array]
+"""Number of the next round; the best so far; the value of each nuclide; whether it may go back for another nuclide."""
+
+
 @pytree
 class _Progress:
     """How far the search is."""
@@ -312,9 +316,10 @@ def _best(
             place=places, nuclide=jnp.full(size, best.nuclide), allowed=yes, sure=sure, apart=yes[0]
         )  # fmt: skip
 
-    def round_(carry: tuple[jax.Array, Tried, jax.Array]) -> tuple[jax.Array, Tried, jax.Array]:
-        number, best, table = carry
-        named = ((number == naming) & (adding | wide)) | (number == closer + again)
+    def round_(carry: _Rounds) -> _Rounds:
+        number, best, table, once = carry
+        later = number == closer + again
+        named = ((number == naming) & (adding | wide)) | later
         kind = jnp.where(number < BEGINNINGS, 0, jnp.where(named, 1, 2))
         candidates = switch(kind, [partial(kind_, best, number) for kind_ in (begin, name, around)])
         u = best.fit.unknowns
@@ -325,17 +330,19 @@ def _best(
         screen = screen_of(tolerant, others, best.fit.rates, position_of(problem.site, best.place), u)
         anew = number >= BEGINNINGS
         before = replace(best, fit=replace(best.fit, value=jnp.where(anew, -jnp.inf, best.fit.value)))
-        best, values = best_of(tolerant, others, u, screen, candidates, before)
-        return number + 1, best, jnp.where(named, values[:known], table)
+        found, values = best_of(tolerant, others, u, screen, candidates, before)
+        # the rounds before led to where another nuclide explained most
+        back = later & once & (found.nuclide != best.nuclide)
+        return jnp.where(back, closer, number + 1), found, jnp.where(named, values[:known], table), once & ~back
 
-    def on(carry: tuple[jax.Array, Tried, jax.Array]) -> jax.Array:
-        number, best, _ = carry
+    def on(carry: _Rounds) -> jax.Array:
+        number, best, *_ = carry
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
         hopeless = adding & (number >= BEGINNINGS) & (ratio < HOPELESS * params.threshold)
         return (number < reaches.shape[0]) & ~hopeless
 
-    start = (first, as_known(problem, state, slot, adding), jnp.zeros(known))
-    return repeat_while(on, round_, start)[1:]
+    start = (first, as_known(problem, state, slot, adding), jnp.zeros(known), jnp.array(True))
+    return repeat_while(on, round_, start)[1:3]
 
 
 def as_known(problem: Problem, state: State, slot: jax.Array, adding: jax.Array) -> Tried:

@@ -80,6 +80,24 @@ def test_a_known_height_stays_fixed(localiser):
     assert float(fits.covariance_m2[0, 2, 2]) < 1e-5
 
 
+def test_a_source_is_found_from_a_place_in_a_building_alone(localiser):
+    """All points of the grid are far off, as the best ones may be where walls hide a source to one side."""
+    half = jnp.array([[7.0, 5.0, 2.5], [0.01, 0.01, 0.01]])
+    centre = jnp.array([[12.0, 4.0, 2.5], [-85.0, -85.0, 0.0]])
+    hollow = replace(SITE.obstacles, centre_m=centre, half_extent_m=half, wall_m=jnp.array([0.2, 0.0]))
+    site = replace(SITE, obstacles=hollow)
+    at = (14.5, 2.0, 1.0)
+    m = drawn(AERIAL, mean_rois(site, DETECTORS, AERIAL, [(at, 500e6, "Co-60")]), 0)
+    known = presumed(site, DETECTORS)
+    assert known.places.there.any()
+    elsewhere = np.array([-30.0, -30.0, 0.0]) + np.array([0.1, 0.1, 1.0]) * known.places.points_m
+    for rooms, found in ((known.places.there, True), (np.zeros_like(known.places.there), False)):
+        places = replace(known.places, points_m=np.float32(elsewhere), there=rooms)
+        fits = localiser(m, replace(known, places=places)).fits
+        near = bool(fits.present[0]) and np.linalg.norm(np.asarray(fits.position_m[0])[:2] - at[:2]) < 3.0
+        assert near == found
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_no_source_is_found_in_a_background_with_a_step(localiser, seed):
     turn = 2.0 * np.pi * seed / 8.0

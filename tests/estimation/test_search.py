@@ -10,11 +10,12 @@ import pytest
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import ways_from
-from swarmsim.estimation.localise import problem_of
+from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
 from swarmsim.estimation.search import Tried, attempt, spread_along
-from swarmsim.estimation.state import no_sources
-from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spectrometer, survey
+from swarmsim.estimation.sources import _sought
+from swarmsim.estimation.state import no_sources, settled, signals
+from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spec, spectrometer, survey
 
 CO_60 = jnp.int32(NUCLIDES.index("Co-60"))
 DETECTORS = (spectrometer(),)
@@ -89,3 +90,26 @@ def test_places_along_the_uncertainty_follow_its_ridge(reach):
     across, along = np.abs(places[1:, 0]).max(), np.abs(places[1:, 1]).max()
     assert 0.5 * reach < along < 3.1 * reach
     assert across < 0.05 * along
+
+
+def test_what_is_sought_again_is_named_again():
+    """It was named where it was sought at first, which may have been metres off."""
+    known, m = told(WALLS)
+    params = localisation_params(spec(search_rounds=4, sources_max=1)).search
+
+    @jax.jit
+    def sought(known, m):
+        problem = problem_of(known, m, SPANS)
+        nothing = no_sources(problem, 1, len(NUCLIDES))
+        wrong = replace(
+            nothing.sources, place=jnp.float32(AT)[None], nuclide=CO_60[None] + 1, present=jnp.array([True])
+        )
+        wrong = replace(wrong, activity_bq=jnp.array([4e8]))
+        state = settled(problem, replace(nothing, sources=wrong, added=signals(problem, wrong, jnp.zeros(2))))
+        no, allowed = jnp.array(False), jnp.ones(len(NUCLIDES), bool)
+        return _sought(problem, known.places, allowed, params, state, jnp.int32(0), no, no)[0].sources
+
+    after = sought(known, m)
+    assert NUCLIDES[int(after.nuclide[0])] == "Co-60"
+    assert int(jnp.argmax(after.nuclide_value[0])) == int(CO_60)
+    assert np.linalg.norm(np.asarray(after.place[0]) - AT) < 0.2
