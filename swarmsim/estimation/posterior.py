@@ -146,7 +146,7 @@ def _around(
     """
     place, nuclide = state.sources.place[k], state.sources.nuclide[k]
     best = as_known(problem, state, k, jnp.array(False)).fit
-    screen = screen_of(problem, others, best.rates, position_of(problem.site, place), best.unknowns)
+    screen = screen_of(problem, others, best.rates, nuclide, position_of(problem.site, place), best.unknowns)
     quick = with_one_ray(problem)
     scouts = spread(place, jnp.asarray(SCOUTED_M), HEIGHTS * problem.height_std_m, SCOUTS, jnp.zeros(()))
     scouts = jnp.clip(jnp.concatenate([scouts, place + _ring()]), *bounds(problem))

@@ -70,24 +70,30 @@ def attempt(problem: Problem, nuclide: jax.Array, others: Others, u: Unknowns, p
 class Screen:
     """What the posterior of other places is approximated with: the fit at one place, linearised. Windows come last."""
 
+    nuclide: jax.Array  # [] int32 of the source of the fit
     left: jax.Array  # [R, n] counts less those of everything but the source sought
     weight: jax.Array  # [R, n] over their variance
     own: jax.Array  # [2, R, n] change with the window's own unknowns
+    of_others: jax.Array  # [R, n] of it what the other sources have of the gain's
     inverse: jax.Array  # [2, 2, n] of the information about those
+    precision: jax.Array  # [2, n] of their priors
     registered: jax.Array  # [n] of the counts that are added
     there: jax.Array  # [C, R, n] change with the source of the fit (log activity, place), and with the other sources
     there_own: jax.Array  # [C, 2, n] of it the part that the window's own unknowns take up
     there_inverse: jax.Array  # [C, C] of the information about those
 
 
-def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array, u: Unknowns) -> Screen:
-    """The screen from the fit ``u`` with a source at ``where`` [3] (world) that adds ``source``."""
+def screen_of(
+    problem: Problem, others: Others, source: Rates, nuclide: jax.Array, where: jax.Array, u: Unknowns
+) -> Screen:  # fmt: skip
+    """The screen from the fit ``u`` with a source of ``nuclide`` at ``where`` [3] (world) that adds ``source``."""
     m = problem.measurements
     assert m.rois is not None
     model = linearised(problem, source, others, where, u)
     zero = jnp.zeros_like(u.gain)
     sources = 1 + u.others.shape[0]
-    own, inverse = of_window(model.columns, sources - 1), normal_equations(problem, model, u).own
+    own, at = of_window(model.columns, sources - 1), normal_equations(problem, model, u)
+    inverse = at.own
     weight = jnp.where(m.valid, problem.trust.T / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
     there = jnp.concatenate([model.columns[:1], model.columns[0] * model.nearer[:, None], model.columns[1:sources]])
     inside = jnp.sum(own * (weight * there)[:, None], axis=2)  # [C, 2, n]
@@ -96,10 +102,13 @@ def screen_of(problem: Problem, others: Others, source: Rates, where: jax.Array,
     information = information.at[3, 3].add(height_precision(problem.height_std_m))
     rest = linearised(problem, source, others, where, replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(())))
     return Screen(
+        nuclide=nuclide,
         left=jnp.where(m.valid, m.rois.T - rest.mean, 0.0),
         weight=weight,
         own=own,
+        of_others=own[1] - model.columns[0],
         inverse=inverse,
+        precision=at.precision,
         registered=model.registered,
         there=there,
         there_own=there_own,
@@ -122,9 +131,10 @@ def _seen(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array
     lengths = jnp.zeros_like(problem.material_std)
     net = rates(problem, ways_from(problem, place), nuclide, lengths).counts.T * screen.registered
     weighted = screen.weight * net
-    inside = jnp.sum(screen.own * weighted, axis=1)
-    of_left = jnp.sum(screen.own * screen.weight * screen.left, axis=1)
-    back = screen.inverse[:, 0] * inside[0] + screen.inverse[:, 1] * inside[1]
+    own, inverse = _own(screen, nuclide, net)
+    inside = jnp.sum(own * weighted, axis=1)
+    of_left = jnp.sum(own * screen.weight * screen.left, axis=1)
+    back = inverse[:, 0] * inside[0] + inverse[:, 1] * inside[1]
     whole = jnp.sum(weighted * net)
     return _Seen(
         weighted=weighted,
@@ -133,6 +143,23 @@ def _seen(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array
         information=whole - jnp.sum(back * inside),
         score=jnp.sum(weighted * screen.left) - jnp.sum(back * of_left),
     )
+
+
+def _own(screen: Screen, nuclide: jax.Array, net: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Change [2, R, n] with the window's own unknowns, and the inverse [2, 2, n] of the information about those.
+
+    A window's gain multiplies what its sources add. With that of the source of the fit, which has the spectrum of
+    another nuclide, any nuclide would explain what that one does.
+    """
+    of_fit = jnp.sum(screen.own[1] - screen.of_others, axis=0)
+    total = jnp.sum(net, axis=0)
+    gain = screen.of_others + net * jnp.where(total > 0.0, of_fit / jnp.maximum(total, 1e-30), 0.0)
+    alike = nuclide == screen.nuclide
+    own = jnp.stack([screen.own[0], jnp.where(alike, screen.own[1], gain)])
+    h = jnp.sum(own[:, None] * own * screen.weight, axis=2) + screen.precision[:, None] * jnp.eye(2)[..., None]
+    determinant = h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0]
+    other = jnp.stack([jnp.stack([h[1, 1], -h[0, 1]]), jnp.stack([-h[1, 0], h[0, 0]])]) / determinant
+    return own, jnp.where(alike, screen.inverse, other)
 
 
 def _value(problem: Problem, seen: _Seen, place: jax.Array) -> jax.Array:

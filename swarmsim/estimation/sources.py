@@ -327,13 +327,13 @@ def _best(
             TOLERANT * reaches[number], problem.model_std, jnp.maximum(problem.model_std, MOST_TOLERANT)
         )
         tolerant = replace(problem, model_std=tolerance)
-        screen = screen_of(tolerant, others, best.fit.rates, position_of(problem.site, best.place), u)
+        screen = screen_of(tolerant, others, best.fit.rates, best.nuclide, position_of(problem.site, best.place), u)
         anew = number >= BEGINNINGS
         before = replace(best, fit=replace(best.fit, value=jnp.where(anew, -jnp.inf, best.fit.value)))
         found, values = best_of(tolerant, others, u, screen, candidates, before)
         # the rounds before led to where another nuclide explained most
         back = later & once & (found.nuclide != best.nuclide)
-        return jnp.where(back, closer, number + 1), found, jnp.where(named, values[:known], table), once & ~back
+        return jnp.where(back, BEGINNINGS, number + 1), found, jnp.where(named, values[:known], table), once & ~back
 
     def on(carry: _Rounds) -> jax.Array:
         number, best, *_ = carry

@@ -300,7 +300,9 @@ def test_what_is_known_of_another_source_beside_one_is_the_information_about_bot
     expected = information[4, 4] - information[4, :4] @ np.linalg.solve(information[:4, :4], information[:4, 4])
     rest = without(state, jnp.int32(0)).added
     best = as_known(problem, state, jnp.int32(0), jnp.array(False)).fit
-    screen = screen_of(problem, rest, best.rates, position_of(SITE, state.sources.place[0]), best.unknowns)
+    screen = screen_of(
+        problem, rest, best.rates, jnp.int32(0), position_of(SITE, state.sources.place[0]), best.unknowns
+    )
     found = looked_at(problem, screen, jnp.int32(0), jnp.asarray(east(apart), jnp.float32))[1]
     assert float(found) == pytest.approx(expected, rel=0.05)
 

@@ -95,7 +95,7 @@ def test_places_along_the_uncertainty_follow_its_ridge(reach):
 def test_what_is_sought_again_is_named_again():
     """It was named where it was sought at first, which may have been metres off."""
     known, m = told(WALLS)
-    params = localisation_params(spec(search_rounds=4, sources_max=1)).search
+    params = localisation_params(spec(search_rounds=5, sources_max=1)).search
 
     @jax.jit
     def sought(known, m):
