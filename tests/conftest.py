@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that the spreading of batches is tested
@@ -67,6 +68,9 @@ _FIRST = (
     "world/test_transforms.py",
 )
 
+# Files that share what takes long to make stay with one worker.
+_SHARING = {"tests/estimation/test_pairs.py": "tests/estimation/test_localise.py"}
+
 _MAPS = 15_000  # the largest files take as many again
 _BYTES = 4e9  # that other processes leave: what JAX keeps within those maps is a gigabyte at most
 # Tracing makes millions of objects that live on: collections among them, at the usual 700, took a tenth of the time.
@@ -83,6 +87,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     missing = [str(path) for path in place if not path.is_file()]
     assert not missing, missing
     items.sort(key=lambda item: place.get(item.path, len(place)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Files go to workers as a whole, those of `_SHARING` together."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = super()._split_scope(nodeid)
+            return _SHARING.get(file, file)
+
+    return Scheduling(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -96,16 +96,17 @@ def starts_of(
     ``allowed`` [N] are the nuclides in question. A place in a building is tried with the nuclide that explains most at
     the nearest point of the grid.
     """
+    places = jax.tree.map(jnp.asarray, places)
     scanned = scan(problem, places.points_m, allowed, others, u)
     index, statistic = strongest(scanned, places.points_m, STARTS, APART_M)
-    near = jnp.asarray(places.near)
+    near = places.near
     order = jnp.argsort(jnp.where(places.there, -scanned.statistic[near], jnp.inf))
     starts = Starts(
-        point_m=jnp.asarray(places.points_m)[index],
+        point_m=places.points_m[index],
         nuclide=scanned.nuclide[index],
-        inside_m=jnp.asarray(places.inside_m)[order],
+        inside_m=places.inside_m[order],
         inside_nuclide=scanned.nuclide[near[order]],
-        there=jnp.asarray(places.there)[order],
+        there=places.there[order],
     )
     return starts, statistic[0]
 

@@ -22,7 +22,9 @@ SITE = place(NOWHERE)
 KNOWN, PARAMS = presumed(SITE, DETECTORS), localisation_params(spec())
 CERTAIN = replace(KNOWN, background_std=jnp.float32(0.01), model_std=jnp.float32(0.001), height_std_m=jnp.float32(0.05))
 AT = np.array([*SOURCE[:2], 1.0])
-DIVIDED = jax.jit(divided)
+# compiled once for all tests: what runs piece by piece is compiled anew for each call
+DIVIDED, STRAIN, OF_OTHERS = jax.jit(divided), jax.jit(strain), jax.jit(of_others)
+PROBLEM, SCREEN = jax.jit(problem_of, static_argnums=2), jax.jit(screen_of)
 
 
 def state_of(truth, given=None, known=KNOWN, seed=None, nuclides=None):
@@ -31,20 +33,27 @@ def state_of(truth, given=None, known=KNOWN, seed=None, nuclides=None):
     They are of Co-60, unless the third of a source's values is another name; those given are of ``nuclides``.
     """
     mean = mean_rois(SITE, DETECTORS, BOTH, [(*one, "Co-60")[:3] for one in truth])
-    problem = problem_of(known, drawn(BOTH, mean, seed) if seed is not None else replace(BOTH, rois=mean), SPANS)
+    problem = PROBLEM(known, drawn(BOTH, mean, seed) if seed is not None else replace(BOTH, rois=mean), SPANS)
     if known is CERTAIN:
         problem = replace(problem, pose_std_m=jnp.zeros_like(problem.pose_std_m))
     given = truth if given is None else given
-    nothing = no_sources(problem, len(given), len(NUCLIDES))
+    places, activities = (jnp.array(x, jnp.float32) for x in zip(*given, strict=True))
+    return problem, with_sources(problem, places, activities, jnp.array(nuclides or [0] * len(given)))
+
+
+@jax.jit
+def with_sources(problem, places, activities, nuclides):
+    """The state with sources there, all else fitted."""
+    nothing = no_sources(problem, len(places), len(NUCLIDES))
     found = replace(
         nothing.sources,
-        present=jnp.ones(len(given), bool),
-        nuclide=jnp.array(nuclides or [0] * len(given)),
-        place=jnp.array([at for at, _ in given], jnp.float32),
-        activity_bq=jnp.array([activity for _, activity in given], jnp.float32),
+        present=jnp.ones(len(places), bool),
+        nuclide=nuclides,
+        place=places,
+        activity_bq=activities,
     )
     added = signals(problem, found, nothing.unknowns.lengths)
-    return problem, settled(problem, replace(nothing, sources=found, added=added))
+    return settled(problem, replace(nothing, sources=found, added=added))
 
 
 def east(metres):
@@ -233,7 +242,7 @@ def test_one_source_strains_nothing_and_two_taken_for_one_do():
     strains, usuals = [], []
     for apart in (0.0, 4.0):
         truth = [(east(x), 0.5 * ACTIVITY) for x in (-0.5 * apart, 0.5 * apart)]
-        found, usual = strain(*state_of(truth, [(AT, ACTIVITY)], seed=5))
+        found, usual = STRAIN(*state_of(truth, [(AT, ACTIVITY)], seed=5))
         strains.append(float(found))
         usuals.append(float(usual))
     assert strains[0] < 30.0
@@ -241,7 +250,7 @@ def test_one_source_strains_nothing_and_two_taken_for_one_do():
     # errors from the prior have 1.40 for each window whose rate is known well: the rover's 60 are half known
     assert all(0.4 * 1.40 * 60 < usual < 1.41 * 90 for usual in usuals)
     # of no source no window tells
-    assert float(strain(*state_of([(AT, 1.0)]))[1]) < 0.1
+    assert float(STRAIN(*state_of([(AT, 1.0)]))[1]) < 0.1
 
 
 def columns_of(truth):
@@ -274,7 +283,7 @@ def test_what_others_places_add_is_that_of_the_information_about_all(apart):
     information = float(problem.learning_rate) * (own - across @ np.linalg.solve(information[8:, 8:], across.T))
     information += np.diag(np.tile([1e-6, 1e-6, 1.0 / float(problem.height_std_m) ** 2, 1e-6], 2))
     every = np.linalg.inv(information)
-    added = np.asarray(of_others(problem, state))
+    added = np.asarray(OF_OTHERS(problem, state))
     for k, own in enumerate((slice(0, 4), slice(4, 8))):
         free = [i for i in range(8) if own.start <= i < own.stop or i % 4 == 3]
         held = np.linalg.inv(information[np.ix_(free, free)])
@@ -285,7 +294,7 @@ def test_what_others_places_add_is_that_of_the_information_about_all(apart):
 
 def test_nothing_is_added_where_others_are_far_off():
     problem, state = state_of([(AT, 200e6), (AT - [45.0, 30.0, 0.0], 200e6)])
-    assert float(jnp.max(jnp.abs(of_others(problem, state)))) == 0.0
+    assert float(jnp.max(jnp.abs(OF_OTHERS(problem, state)))) == 0.0
 
 
 @pytest.mark.parametrize("apart", [3.0, 8.0, 12.0])
@@ -300,9 +309,7 @@ def test_what_is_known_of_another_source_beside_one_is_the_information_about_bot
     expected = information[4, 4] - information[4, :4] @ np.linalg.solve(information[:4, :4], information[:4, 4])
     rest = without(state, jnp.int32(0)).added
     best = as_known(problem, state, jnp.int32(0), jnp.array(False)).fit
-    screen = screen_of(
-        problem, rest, best.rates, jnp.int32(0), position_of(SITE, state.sources.place[0]), best.unknowns
-    )
+    screen = SCREEN(problem, rest, best.rates, jnp.int32(0), position_of(SITE, state.sources.place[0]), best.unknowns)
     found = looked_at(problem, screen, jnp.int32(0), jnp.asarray(east(apart), jnp.float32))[1]
     assert float(found) == pytest.approx(expected, rel=0.05)
 
