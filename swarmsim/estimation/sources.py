@@ -33,6 +33,7 @@ PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search 
 HOPELESS = 0.4  # of the threshold: the ratio at the best of some starts below which no further round is worth while
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
+MOVED = 0.2  # times the threshold: what a source sought again explains more, from which on the others are sought again
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 DIVISIONS = 4  # of one into two, or of two into other two, at most
@@ -81,10 +82,10 @@ class _Progress:
 def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: SearchParams, state: State) -> State:
     """Seek the sources of ``state`` again, then add others until no further one explains the counts beyond chance.
 
-    After each that is added the others are sought again. Then the one that is missed least is left out for a trial: the
-    first source found between two others is none, and the others, sought again, explain the counts as well. In the end
-    one is taken for two where that is what the counts ask for, and companions are taken away
-    (`swarmsim.estimation.pairs`).
+    After each that is added the others are sought again, and so on as long as that explains more. Then the one that is
+    missed least is left out for a trial: the first source found between two others is none, and the others, sought
+    again, explain the counts as well. In the end one is taken for two where that is what the counts ask for, and
+    companions are taken away (`swarmsim.estimation.pairs`).
 
     Args:
         problem: the data.
@@ -111,7 +112,10 @@ def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: S
         state, found = _sought(problem, places, allowed, params, p.state, slot, adding, p.wide)
         present = state.sources.present
         mine = jnp.arange(present.shape[0]) == slot
-        again = jnp.where(adding & found, present, p.again) & ~mine
+        # where it was before it held the others beside it where they are
+        rise = 2.0 * (state.likelihood - p.state.likelihood)
+        moved = found & (adding | (~p.wide & (rise > MOVED * params.further)))
+        again = jnp.where(moved, present, p.again) & ~mine
         done = ~jnp.any(again) & (found | ~adding)
         wide = p.wide & jnp.any(again) & ~adding
         p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
