@@ -134,7 +134,7 @@ class Localisation(Model):
 
     A source is one where twice the logarithm of the likelihood ratio exceeds the square of ``detection_sigma``; beside
     another one, whose errors of the model look like further sources, that of ``further_sigma``. Sources are looked for
-    at points ``grid_m`` apart and in all buildings, then within ``search_radius_m`` of the best of them, then in
+    at points ``grid_m`` apart and in buildings, then within ``search_radius_m`` of the best of them, then in
     ``search_rounds`` rounds, each about half as far as the one before. The posterior of each is that of at most
     ``sample_rounds`` times ``samples`` places. ``rays_per_window`` lead to each window along its way, which walls'
     shadows may cross.

@@ -153,7 +153,9 @@ def _own(screen: Screen, nuclide: jax.Array, net: jax.Array) -> tuple[jax.Array,
     """
     of_fit = jnp.sum(screen.own[1] - screen.of_others, axis=0)
     total = jnp.sum(net, axis=0)
-    gain = screen.of_others + net * jnp.where(total > 0.0, of_fit / jnp.maximum(total, 1e-30), 0.0)
+    # both are negative where a detector beyond saturation registers less for more
+    some = total != 0.0
+    gain = screen.of_others + net * jnp.where(some, of_fit / jnp.where(some, total, 1.0), 0.0)
     alike = nuclide == screen.nuclide
     own = jnp.stack([screen.own[0], jnp.where(alike, screen.own[1], gain)])
     h = jnp.sum(own[:, None] * own * screen.weight, axis=2) + screen.precision[:, None] * jnp.eye(2)[..., None]
@@ -260,7 +262,9 @@ def best_of(
     )  # fmt: skip
     value = jnp.where(rank[chosen] > -jnp.inf, tried.fit.value, -jnp.inf)
     first = jnp.argmax(value)
-    values = jnp.where(c.allowed, seen + (value - seen[chosen])[first], -jnp.inf).at[chosen].set(value)
+    # those that are not fitted are no better than the best of those that are
+    others_ = jnp.minimum(seen + (value - seen[chosen])[first], value[first])
+    values = jnp.where(c.allowed, others_, -jnp.inf).at[chosen].set(value)
     better = value[first] > best.fit.value
     return jax.tree.map(lambda a, b: jnp.where(better, a[first], b), tried, best), values
 

@@ -23,8 +23,8 @@ from swarmsim.estimation.state import State, ratios, settled, shared, signals, w
 from swarmsim.pytree import pytree, static
 
 PART = 12  # candidates in each part of a round, at least
-INSIDE = 1  # rounds that try places in buildings
-BEGINNINGS = INSIDE + STARTS // FITTED  # and points of the grid
+INDOORS = 1  # rounds that try places in buildings, those where the open air's statistic is largest
+BEGINNINGS = INDOORS + STARTS // FITTED  # and points of the grid
 AROUND = 1.5  # how far around a grid point, over the distance from one to the next
 REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; nuclides are compared in the second
 CLOSING = 0.55  # reach of a later round over that of the one before
@@ -33,7 +33,9 @@ PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search 
 HOPELESS = 0.4  # of the threshold: the ratio at the best of some starts below which no further round is worth while
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
-MOVED = 0.2  # times the threshold: what a source sought again explains more, from which on the others are sought again
+MOVED = (
+    0.2  # times `SearchParams.further`: what one sought again explains more, from which on the others are sought again
+)
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 DIVISIONS = 4  # of one into two, or of two into other two, at most
@@ -114,7 +116,9 @@ def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: S
         mine = jnp.arange(present.shape[0]) == slot
         # where it was before it held the others beside it where they are
         rise = 2.0 * (state.likelihood - p.state.likelihood)
-        moved = found & (adding | (~p.wide & (rise > MOVED * params.further)))
+        # half of the seeks are for those to be added, and for trials
+        spare = p.left > SEEKS_PER_SOURCE * params.sources_max // 2
+        moved = found & (adding | (~p.wide & spare & (rise > MOVED * params.further)))
         again = jnp.where(moved, present, p.again) & ~mine
         done = ~jnp.any(again) & (found | ~adding)
         wide = p.wide & jnp.any(again) & ~adding
@@ -232,7 +236,6 @@ def _sought(
     """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one."""
     s = state.sources
     others = without(state, slot).added
-
     starts, statistic = for_those(
         adding | wide,
         lambda: starts_of(problem, places, allowed, others, state.unknowns),
@@ -272,23 +275,24 @@ def _best(
     again = min(NAMED_AGAIN, params.rounds)
     closing = CLOSING ** jnp.array([*range(1, again + 1), *range(again, params.rounds + 1)])
     reaches = params.reach_m * jnp.concatenate([jnp.ones(BEGINNINGS), jnp.array(REACHES), closing])
-    outdoors = INSIDE - jnp.minimum(-(-jnp.sum(starts.there) // size), INSIDE)
+    outdoors = INDOORS - jnp.minimum(-(-jnp.sum(starts.there) // size), INDOORS)
     first = jnp.where(adding | wide, outdoors, closer)
     s = state.sources
     yes, no = jnp.ones(size, bool), jnp.zeros(size, bool)
     up_m = 1.5 * problem.height_std_m
 
     def begin(best: Tried, number: jax.Array) -> Candidates:
-        index = FITTED * jnp.clip(number - INSIDE, 0, BEGINNINGS - INSIDE - 1) + jnp.arange(FITTED)
+        index = FITTED * jnp.clip(number - INDOORS, 0, BEGINNINGS - INDOORS - 1) + jnp.arange(FITTED)
         centre = jnp.concatenate([starts.point_m[index, :2], jnp.broadcast_to(problem.height_m, (FITTED, 1))], axis=1)
         around = jax.vmap(lambda c: spread(c, AROUND * params.grid_m, up_m, size // FITTED, number))(centre)
         nuclides = jnp.repeat(starts.nuclide[index], size // FITTED)
         # where a source was found before is the first candidate
-        known_one = ~adding & (number == INSIDE) & (jnp.arange(size) == 0)
+        known_one = ~adding & (number == INDOORS) & (jnp.arange(size) == 0)
         places = jnp.where(known_one[:, None], s.place[slot], around.reshape(-1, 3))
         nuclides = jnp.where(known_one, s.nuclide[slot], nuclides)
-        indoors = number < INSIDE
-        room = jnp.minimum(size * jnp.minimum(number, INSIDE - 1) + jnp.arange(size), starts.there.shape[0] - 1)
+        indoors = number < INDOORS
+        first_room = size * jnp.clip(number - outdoors, 0, INDOORS - 1)
+        room = jnp.minimum(first_room + jnp.arange(size), starts.there.shape[0] - 1)
         inside = jnp.concatenate([starts.inside_m[room], jnp.broadcast_to(problem.height_m, (size, 1))], axis=1)
         return Candidates(
             place=jnp.where(indoors, inside, places),

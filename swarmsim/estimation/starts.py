@@ -2,7 +2,7 @@
 
 Walls of a building hide a source from one side and let it through on another, so that the open air's statistic
 (`swarmsim.estimation.scan`) may be largest metres away, and the building it lies in not be among the best. So places in
-all hollow boxes are looked at besides, with rays.
+hollow boxes are looked at besides, with rays.
 """
 
 import jax
@@ -20,8 +20,7 @@ from swarmsim.site.rooms import rooms_of
 STARTS = 8  # grid points that are tried for a further source
 APART_M = 12.0  # between those
 POINTS_MAX = 20_000  # of the grid
-INSIDE_MAX = 960  # places in buildings
-INSIDE = 96  # their number is a multiple of this, so that few sites differ in it
+ROOMS = 960  # places in buildings; the array always has as many, so that another area is only another value
 FROM_WALLS_M = 0.3
 
 
@@ -56,11 +55,13 @@ def places_of(site: Site, corners_m: np.ndarray, step_m: float, height_m: float)
     axes = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True)]
     xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     inside = _inside(site, low - step, high + step, step)
+    there = np.arange(ROOMS) < len(inside)
     # what fills the array up is a point of the grid
-    fill = -len(inside) % INSIDE if len(inside) else INSIDE
-    there = np.arange(len(inside) + fill) < len(inside)
-    inside = np.concatenate([inside, np.tile(xy[:1], (fill, 1))])
-    near = [np.argmin(np.sum(np.square(xy - one), axis=1)) for one in inside]
+    inside = np.concatenate([inside, np.tile(xy[:1], (ROOMS - len(inside), 1))])
+    spacing = np.array([axis[1] - axis[0] for axis in axes])
+    last = [len(axis) - 1 for axis in axes]
+    column, row = np.clip(np.rint((inside - low) / np.maximum(spacing, 1e-9)), 0, last).astype(int).T
+    near = row * len(axes[0]) + column
     return Places(
         points_m=on_host(np.column_stack([xy, height_at(site, xy) + height_m])),
         inside_m=on_host(inside),
@@ -70,22 +71,27 @@ def places_of(site: Site, corners_m: np.ndarray, step_m: float, height_m: float)
 
 
 def _inside(site: Site, low: np.ndarray, high: np.ndarray, step_m: float) -> np.ndarray:
-    """Places [I, 2] in the hollow boxes between ``low`` and ``high`` [2]: the fewest that are ``step_m`` apart."""
+    """Places [I, 2] in the hollow boxes between ``low`` and ``high`` [2]: one in each, and at most ``step_m`` apart.
+
+    Where there would be too many they are farther apart, and some boxes have none.
+    """
     rooms = rooms_of(site, FROM_WALLS_M)
+    near = np.all((rooms.centre_m[:, :2] >= low) & (rooms.centre_m[:, :2] <= high), axis=1)
+    centre, reach, axis = (x[near] for x in (rooms.centre_m[:, :2], rooms.reach_m, rooms.axis))
     step = step_m
     while True:
-        parts = np.maximum(np.ceil(2.0 * rooms.reach_m / step), 1).astype(int)
-        if np.sum(np.prod(parts, axis=1)) <= INSIDE_MAX or np.all(parts == 1):
+        parts = np.maximum(np.ceil(2.0 * reach / step), 1).astype(int)
+        if np.sum(np.prod(parts, axis=1)) <= ROOMS or np.all(parts == 1):
             break
         step *= 1.25
     made = [np.zeros((0, 2))]
-    for centre, reach, axis, (along, across) in zip(rooms.centre_m, rooms.reach_m, rooms.axis, parts, strict=True):
+    for number, (along, across) in enumerate(parts):
         shares = np.meshgrid((2 * np.arange(along) + 1) / along - 1, (2 * np.arange(across) + 1) / across - 1)
-        one, other = (reach[k] * shares[k].ravel() for k in range(2))
-        turned = np.stack([axis[0] * one - axis[1] * other, axis[1] * one + axis[0] * other], axis=1)
-        made.append(centre[:2] + turned)
+        one, other = (reach[number, k] * shares[k].ravel() for k in range(2))
+        (c, s), middle = axis[number], centre[number]
+        made.append(middle + np.stack([c * one - s * other, s * one + c * other], axis=1))
     every = np.concatenate(made)
-    return every[np.all((every >= low) & (every <= high), axis=1)][:INSIDE_MAX]
+    return every[np.linspace(0, len(every) - 1, ROOMS).astype(int)] if len(every) > ROOMS else every
 
 
 def starts_of(

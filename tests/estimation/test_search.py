@@ -12,7 +12,7 @@ from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
-from swarmsim.estimation.search import Tried, attempt, spread_along
+from swarmsim.estimation.search import Screen, Tried, _own, attempt, spread_along
 from swarmsim.estimation.sources import _sought
 from swarmsim.estimation.state import no_sources, settled, signals
 from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spec, spectrometer, survey
@@ -113,3 +113,26 @@ def test_what_is_sought_again_is_named_again():
     assert NUCLIDES[int(after.nuclide[0])] == "Co-60"
     assert int(jnp.argmax(after.nuclide_value[0])) == int(CO_60)
     assert np.linalg.norm(np.asarray(after.place[0]) - AT) < 0.2
+
+
+def test_a_window_s_gain_has_the_spectrum_of_the_nuclide_that_is_asked_for():
+    """One with the spectrum of the source of the fit is as that one, also where a detector registers less for more."""
+    rng = np.random.default_rng(0)
+    registered = np.array([0.9, 0.5, -0.2, 0.0])  # [n] of what is added
+    source, others, background, weight = rng.uniform(0.5, 2.0, (4, 5, 4))
+    precision = np.array([[100.0] * 4, [4.0] * 4])
+    own = np.stack([background, (source + others) * registered])
+    inverse = np.linalg.inv(np.einsum("arn,brn,rn->nab", own, own, weight) + [np.diag(p) for p in precision.T])
+    screen = Screen(
+        nuclide=CO_60, left=weight, weight=weight, own=own, of_others=others * registered,
+        inverse=np.moveaxis(inverse, 0, 2), precision=precision, registered=registered,
+        there=own, there_own=own, there_inverse=own,
+    )  # fmt: skip
+    for nuclide in (CO_60, CO_60 + 1):
+        mine, back = _own(screen, nuclide, jnp.asarray(3.0 * source * registered))
+        np.testing.assert_allclose(mine, own, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(back, screen.inverse, rtol=1e-4, atol=1e-6)
+    mine, _ = _own(screen, CO_60 + 1, jnp.asarray(source[::-1] * registered))
+    np.testing.assert_allclose(
+        mine[1], (source[::-1] * source.sum(0) / source[::-1].sum(0) + others) * registered, rtol=1e-5
+    )

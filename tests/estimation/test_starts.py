@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmsim.estimation.starts import INSIDE, INSIDE_MAX, places_of
+from swarmsim.estimation.starts import ROOMS, places_of
 from tests.estimation.survey import place
 
 CORNERS = 70.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -36,7 +36,7 @@ def test_every_spot_of_a_building_is_near_a_place_in_it(x, y, length, width, yaw
     spots = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 2)) * np.maximum(corner, 0.0)
     apart = np.linalg.norm(spots[:, None] - own, axis=2).min(axis=1)
     assert np.all(apart < 2.0 * np.sqrt(2.0) + 1e-3)
-    assert len(there) % INSIDE == 0
+    assert len(there) == ROOMS
 
 
 def test_the_nearest_point_of_the_grid_is_known():
@@ -47,7 +47,7 @@ def test_the_nearest_point_of_the_grid_is_known():
 
 def test_a_site_without_buildings_has_no_places_in_them():
     places = places_of(place(), CORNERS, 4.0, 1.0)
-    assert places.there.shape == (INSIDE,)
+    assert places.there.shape == (ROOMS,)
     assert not places.there.any()
     assert np.isfinite(places.inside_m).all()
 
@@ -56,10 +56,27 @@ def test_a_town_has_one_place_in_each_building_at_least():
     side = np.arange(-65.0, 66.0, 5.0)
     town = [((x, y), (2.2, 2.2)) for x in side for y in side]
     places = places_of(site_of(town), CORNERS, 1.0, 1.0)
-    assert len(town) <= places.there.sum() <= INSIDE_MAX
+    assert len(town) <= places.there.sum() <= ROOMS
     inside = places.inside_m[places.there]
     apart = np.linalg.norm(np.array([at for at, _ in town])[:, None] - inside, axis=2).min(axis=1)
     assert np.all(apart < 2.2)
+
+
+def test_where_there_are_too_many_buildings_those_with_a_place_lie_all_over_the_area():
+    side = np.arange(-69.0, 70.0, 3.0)
+    places = places_of(site_of([((x, y), (1.2, 1.2)) for x in side for y in side]), CORNERS, 1.0, 1.0)
+    assert places.there.all()
+    assert np.all(np.ptp(places.inside_m, axis=0) > 130.0)
+
+
+def test_buildings_outside_the_area_take_no_place_from_those_inside():
+    hall, far = (
+        ((0.0, 0.0), (20.0, 15.0)),
+        [((200.0 + x, y), (3.0, 3.0)) for x in range(0, 400, 10) for y in range(-150, 150, 10)],
+    )
+    alone, among = (places_of(site_of(boxes), CORNERS, 4.0, 1.0) for boxes in ([hall], [*far, hall]))
+    np.testing.assert_allclose(among.inside_m, alone.inside_m, atol=1e-4)
+    assert among.there.sum() == 80
 
 
 @pytest.mark.parametrize("x", [120.0, -120.0])
