@@ -84,10 +84,10 @@ class _Progress:
 def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: SearchParams, state: State) -> State:
     """Seek the sources of ``state`` again, then add others until no further one explains the counts beyond chance.
 
-    After each that is added the others are sought again, and so on as long as that explains more. Then the one that is
-    missed least is left out for a trial: the first source found between two others is none, and the others, sought
-    again, explain the counts as well. In the end one is taken for two where that is what the counts ask for, and
-    companions are taken away (`swarmsim.estimation.pairs`).
+    After each that is added the others are sought again. Then the one that is missed least is left out for a trial: the
+    first source found between two others is none, and the others, sought again, explain the counts as well. In the end
+    one is taken for two where that is what the counts ask for, and companions are taken away
+    (`swarmsim.estimation.pairs`).
 
     Args:
         problem: the data.
@@ -114,12 +114,7 @@ def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: S
         state, found = _sought(problem, places, allowed, params, p.state, slot, adding, p.wide)
         present = state.sources.present
         mine = jnp.arange(present.shape[0]) == slot
-        # where it was before it held the others beside it where they are
-        rise = 2.0 * (state.likelihood - p.state.likelihood)
-        # half of the seeks are for those to be added, and for trials
-        spare = p.left > SEEKS_PER_SOURCE * params.sources_max // 2
-        moved = found & (adding | (~p.wide & spare & (rise > MOVED * params.further)))
-        again = jnp.where(moved, present, p.again) & ~mine
+        again = jnp.where(adding & found, present, p.again) & ~mine
         done = ~jnp.any(again) & (found | ~adding)
         wide = p.wide & jnp.any(again) & ~adding
         p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
@@ -281,10 +276,14 @@ def _best(
     yes, no = jnp.ones(size, bool), jnp.zeros(size, bool)
     up_m = 1.5 * problem.height_std_m
 
+    def turn_of(number: jax.Array) -> jax.Array:
+        """By how much a round's pattern is turned: rounds of buildings and names draw none."""
+        return (number - INDOORS - (number > closer + again)).astype(jnp.float32)
+
     def begin(best: Tried, number: jax.Array) -> Candidates:
         index = FITTED * jnp.clip(number - INDOORS, 0, BEGINNINGS - INDOORS - 1) + jnp.arange(FITTED)
         centre = jnp.concatenate([starts.point_m[index, :2], jnp.broadcast_to(problem.height_m, (FITTED, 1))], axis=1)
-        around = jax.vmap(lambda c: spread(c, AROUND * params.grid_m, up_m, size // FITTED, number))(centre)
+        around = jax.vmap(lambda c: spread(c, AROUND * params.grid_m, up_m, size // FITTED, turn_of(number)))(centre)
         nuclides = jnp.repeat(starts.nuclide[index], size // FITTED)
         # where a source was found before is the first candidate
         known_one = ~adding & (number == INDOORS) & (jnp.arange(size) == 0)
@@ -313,7 +312,7 @@ def _best(
 
     def around(best: Tried, number: jax.Array) -> Candidates:
         reach_m, index = reaches[number], jnp.arange(size)
-        turn = number.astype(jnp.float32)
+        turn = turn_of(number)
         part = size // FITTED
         near = spread(best.place, reach_m, jnp.minimum(reach_m, up_m), size - part, turn)
         places = jnp.concatenate([near, spread_along(problem, best, reach_m, part, turn)])
