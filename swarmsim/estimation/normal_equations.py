@@ -106,6 +106,13 @@ def of_window(columns: jax.Array, sources: int) -> jax.Array:
     return jnp.stack([columns[1 + sources], jnp.sum(columns[: 1 + sources], axis=0)])
 
 
+def inverse_of_two(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Inverse [2, 2, n] and determinant [n] of matrices [2, 2, n]."""
+    determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
+    turned = jnp.stack([jnp.stack([matrix[1, 1], -matrix[0, 1]]), jnp.stack([-matrix[1, 0], matrix[0, 0]])])
+    return turned / determinant, determinant
+
+
 def _variance(
     problem: Problem, own: jax.Array, rest: jax.Array, others: Others, where: jax.Array, edge: jax.Array
 ) -> jax.Array:
@@ -181,8 +188,7 @@ def _eliminated(problem: Problem, model: Linearised, u: Unknowns) -> _Eliminated
     crossing = of_window(products, k)
     precision = _own_precision(problem, model.variance, u)
     h = of_window(jnp.swapaxes(crossing, 0, 1), k) + precision[:, None] * jnp.eye(2)[..., None]
-    determinant = h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0]
-    own = jnp.stack([jnp.stack([h[1, 1], -h[0, 1]]), jnp.stack([-h[1, 0], h[0, 0]])]) / determinant
+    own, determinant = inverse_of_two(h)
     own_push = of_window(pushes, k) - precision * window_unknowns(u)
     turned = own[:, 0, None] * crossing[0] + own[:, 1, None] * crossing[1]  # [2, B, n]
     return _Eliminated(

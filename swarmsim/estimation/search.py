@@ -19,6 +19,7 @@ from swarmsim.estimation.normal_equations import (
     MEAN_FLOOR,
     Others,
     Unknowns,
+    inverse_of_two,
     linearised,
     normal_equations,
     of_window,
@@ -159,9 +160,7 @@ def _own(screen: Screen, nuclide: jax.Array, net: jax.Array) -> tuple[jax.Array,
     alike = nuclide == screen.nuclide
     own = jnp.stack([screen.own[0], jnp.where(alike, screen.own[1], gain)])
     h = jnp.sum(own[:, None] * own * screen.weight, axis=2) + screen.precision[:, None] * jnp.eye(2)[..., None]
-    determinant = h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0]
-    other = jnp.stack([jnp.stack([h[1, 1], -h[0, 1]]), jnp.stack([-h[1, 0], h[0, 0]])]) / determinant
-    return own, jnp.where(alike, screen.inverse, other)
+    return own, jnp.where(alike, screen.inverse, inverse_of_two(h)[0])
 
 
 def _value(problem: Problem, seen: _Seen, place: jax.Array) -> jax.Array:
@@ -263,8 +262,8 @@ def best_of(
     value = jnp.where(rank[chosen] > -jnp.inf, tried.fit.value, -jnp.inf)
     first = jnp.argmax(value)
     # those that are not fitted are no better than the best of those that are
-    others_ = jnp.minimum(seen + (value - seen[chosen])[first], value[first])
-    values = jnp.where(c.allowed, others_, -jnp.inf).at[chosen].set(value)
+    unfitted = jnp.minimum(seen + (value - seen[chosen])[first], value[first])
+    values = jnp.where(c.allowed, unfitted, -jnp.inf).at[chosen].set(value)
     better = value[first] > best.fit.value
     return jax.tree.map(lambda a, b: jnp.where(better, a[first], b), tried, best), values
 

@@ -28,14 +28,11 @@ BEGINNINGS = INDOORS + STARTS // FITTED  # and points of the grid
 AROUND = 1.5  # how far around a grid point, over the distance from one to the next
 REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; nuclides are compared in the second
 CLOSING = 0.55  # reach of a later round over that of the one before
-NAMED_AGAIN = 3  # of those rounds, after which nuclides are compared again, where the source is known to a metre
+NAMED_AGAIN = 3  # of those rounds, after which nuclides are compared again: from a reach of 6 m one is known to a metre then
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
 HOPELESS = 0.4  # of the threshold: the ratio at the best of some starts below which no further round is worth while
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
-MOVED = (
-    0.2  # times `SearchParams.further`: what one sought again explains more, from which on the others are sought again
-)
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 DIVISIONS = 4  # of one into two, or of two into other two, at most
@@ -263,7 +260,7 @@ def _best(
     adding: jax.Array,
     wide: jax.Array,
 ) -> tuple[Tried, jax.Array]:
-    """The best place from some grid points, or from where the source is, and the value of each nuclide [N]."""
+    """The best place from some of buildings and of the grid, or from where it is, and each nuclide's value [N]."""
     known = allowed.shape[0]
     size = FITTED * max(PART, -(-known // FITTED))
     naming, closer = BEGINNINGS + 1, BEGINNINGS + len(REACHES)

@@ -21,7 +21,7 @@ STARTS = 8  # grid points that are tried for a further source
 APART_M = 12.0  # between those
 POINTS_MAX = 20_000  # of the grid
 ROOMS = 960  # places in buildings; the array always has as many, so that another area is only another value
-FROM_WALLS_M = 0.3
+FROM_WALLS_M = 0.3  # of places in buildings
 
 
 @pytree

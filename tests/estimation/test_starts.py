@@ -70,10 +70,8 @@ def test_where_there_are_too_many_buildings_those_with_a_place_lie_all_over_the_
 
 
 def test_buildings_outside_the_area_take_no_place_from_those_inside():
-    hall, far = (
-        ((0.0, 0.0), (20.0, 15.0)),
-        [((200.0 + x, y), (3.0, 3.0)) for x in range(0, 400, 10) for y in range(-150, 150, 10)],
-    )
+    hall = ((0.0, 0.0), (20.0, 15.0))
+    far = [((x, y), (3.0, 3.0)) for x in range(200, 600, 10) for y in range(-150, 150, 10)]
     alone, among = (places_of(site_of(boxes), CORNERS, 4.0, 1.0) for boxes in ([hall], [*far, hall]))
     np.testing.assert_allclose(among.inside_m, alone.inside_m, atol=1e-4)
     assert among.there.sum() == 80
