@@ -19,7 +19,8 @@ from swarmsim.estimation.likelihood import natural_background, position_covarian
 from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.pairs import strain
 from swarmsim.estimation.posterior import of_others, posteriors
-from swarmsim.estimation.sources import SearchParams, find_sources
+from swarmsim.estimation.seek import SearchParams
+from swarmsim.estimation.sources import find_sources
 from swarmsim.estimation.starts import Places, places_of
 from swarmsim.estimation.state import Sources, State, no_sources, ratios
 from swarmsim.pytree import on_host, pytree, static

@@ -28,7 +28,7 @@ from swarmsim.estimation.search import (
     screen_of,
     spread,
 )
-from swarmsim.estimation.sources import as_known
+from swarmsim.estimation.seek import as_known
 from swarmsim.estimation.state import ALONE_STEPS, State, without
 from swarmsim.pytree import pytree
 

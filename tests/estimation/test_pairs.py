@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmsim.estimation import localisation_params, pairs, sources
+from swarmsim.estimation import localisation_params, pairs, seek, sources
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.pairs import are_mixed, divided, joined, strain
 from swarmsim.estimation.posterior import of_others
 from swarmsim.estimation.search import looked_at, screen_of
-from swarmsim.estimation.sources import as_known
+from swarmsim.estimation.seek import as_known
 from swarmsim.estimation.state import no_sources, settled, signals, without
 from tests.estimation.conftest import BOTH, DETECTORS, NOWHERE, SPANS
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, drawn, mean_rois, place, presumed, spec
@@ -321,8 +321,8 @@ def test_what_is_sought_again_does_not_go_where_it_explains_less(monkeypatch):
         tried = as_known(problem, state, jnp.int32(0), no)
         fit = replace(tried.fit, likelihood=state.likelihood - loss)
         elsewhere = replace(tried, place=tried.place + 3.0, fit=fit)
-        monkeypatch.setattr(sources, "_best", lambda *_, found=elsewhere: (found, jnp.zeros(len(NUCLIDES))))
-        after, _ = sources._sought(problem, KNOWN.places, allowed, PARAMS.search, state, jnp.int32(0), no, no)
+        monkeypatch.setattr(seek, "_best", lambda *_, found=elsewhere: (found, jnp.zeros(len(NUCLIDES))))
+        after, _ = seek.sought(problem, KNOWN.places, allowed, PARAMS.search, state, jnp.int32(0), no, no)
         assert bool(jnp.allclose(after.sources.place[0], tried.place)) == stays
 
 

@@ -13,7 +13,7 @@ from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
 from swarmsim.estimation.search import Screen, Tried, _own, attempt, spread_along
-from swarmsim.estimation.sources import _sought
+from swarmsim.estimation.seek import sought as seek
 from swarmsim.estimation.state import no_sources, settled, signals
 from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spec, spectrometer, survey
 
@@ -107,7 +107,7 @@ def test_what_is_sought_again_is_named_again():
         wrong = replace(wrong, activity_bq=jnp.array([4e8]))
         state = settled(problem, replace(nothing, sources=wrong, added=signals(problem, wrong, jnp.zeros(2))))
         no, allowed = jnp.array(False), jnp.ones(len(NUCLIDES), bool)
-        return _sought(problem, known.places, allowed, params, state, jnp.int32(0), no, no)[0].sources
+        return seek(problem, known.places, allowed, params, state, jnp.int32(0), no, no)[0].sources
 
     after = sought(known, m)
     assert NUCLIDES[int(after.nuclide[0])] == "Co-60"
