@@ -150,8 +150,8 @@ class Localisation(Model):
     grid_m: float = Field(default=4.0, ge=0.1, le=1000)
     search_radius_m: float = Field(default=6.0, ge=0.01, le=1000)
     search_rounds: int = Field(default=7, ge=1, le=100)
-    sample_rounds: int = Field(default=24, ge=1, le=100)
-    samples: int = Field(default=40, ge=16, le=10_000)
+    sample_rounds: int = Field(default=40, ge=1, le=100)
+    samples: int = Field(default=24, ge=16, le=10_000)
 
 
 class Knowledge(Model):

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.device import either
 from swarmsim.estimation.likelihood import position_of, travel_gain
 from swarmsim.estimation.measurements import Measurements
 from swarmsim.pytree import pytree, static
@@ -146,13 +145,20 @@ def ways_from(problem: Problem, place: jax.Array) -> Ways:
     wanted = jnp.concatenate([jnp.repeat(valid[first:last], rays) for first, last, _, rays in problem.spans])
     ends = jnp.concatenate([nodes.position_m for nodes in problem.nodes])
     # of all spans at once: it is compiled at several places
-    every = crossed_from(problem.site, position, ends, wanted)
+    every = crossed_from(problem.site, position, ends, wanted, _middles(problem.spans))
     rows = np.cumsum([0, *(nodes.position_m.shape[0] for nodes in problem.nodes)])
     crossed = tuple(
         jax.tree.map(lambda x, part=slice(first, last): x[part], every)
         for first, last in itertools.pairwise(rows.tolist())
     )
     return Ways(crossed=crossed, position_m=position)
+
+
+def _middles(spans: tuple[Span, ...]) -> np.ndarray:
+    """For each ray the number of the middle one of its window."""
+    windows = np.concatenate([np.repeat([rays], last - first) for first, last, _, rays in spans])
+    first = np.cumsum(windows) - windows
+    return np.repeat(first + windows // 2, windows)
 
 
 @jax.jit  # traced once for all places of a program that call it
@@ -164,19 +170,10 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) 
     materials = len(problem.site.material_names)
     factors = jnp.ones(materials).at[jnp.array(problem.uncertain, jnp.int32)].set(jnp.exp(lengths))
     source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
-    parts = []
-    for span, nodes, crossed in zip(problem.spans, problem.nodes, ways.crossed, strict=True):
-        way = stretched(crossed, factors)
-
-        def seen(span: Span = span, nodes: Nodes = nodes, way: Crossed = way) -> Rates:
-            return _rates_of_span(problem, span, nodes, source, way)
-
-        first, last = span[:2]
-
-        def nothing(rows: int = last - first) -> Rates:
-            return jax.tree.map(lambda x: x[:rows], silent(problem))
-
-        parts.append(either(jnp.any(problem.measurements.valid[first:last]), seen, nothing))
+    parts = [
+        _rates_of_span(problem, span, nodes, source, stretched(crossed, factors))
+        for span, nodes, crossed in zip(problem.spans, problem.nodes, ways.crossed, strict=True)
+    ]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
@@ -186,7 +183,8 @@ def _rates_of_span(problem: Problem, span: Span, nodes: Nodes, source: Source, w
     offset = position - source.position_m
     detector, exposure = problem.detectors[number], problem.measurements.exposure_s[first:last]
     weight = jnp.tile(share, last - first) * inverse_square_gain(offset, nodes.pieces_m, rays)
-    found = roi_rates_and_slopes(detector, source, way, position, nodes.axis, problem.uncertain, weight, rays)
+    asked = jnp.any(problem.measurements.valid[first:last])
+    found = roi_rates_and_slopes(detector, source, way, position, nodes.axis, problem.uncertain, weight, rays, asked)
     strength = (found.net * jnp.sum(offset * offset, axis=1)).reshape(-1, rays)
     mean = jnp.sum(share * strength, axis=1)
     spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)

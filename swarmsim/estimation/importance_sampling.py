@@ -28,9 +28,10 @@ _EVEN = (0.8191725, 0.6710436, 0.5497005)
 FIRST_SPREAD = 2.0  # standard deviations of the first round over those that the curvature promises
 SCALES = (2.5, 1.2, 1.2, 0.6)  # spread of a round's places, in turn, over that of the places weighed so far
 ABOUT_MEAN = 3  # so many of the scales are about the mean: no tail goes unseen. The others are about likely places.
-LEAST_EFFECTIVE = 16.0  # weights are flattened until they count as this many when the next round is placed
+PLACED_EFFECTIVE = 8.0  # weights are flattened until they count as this many when the next round is placed
+LEAST_EFFECTIVE = 16.0  # and as this many for the moments
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
-LEAST_ROUNDS = 4
+LEAST_ROUNDS = 5
 LEAST_STD_M = 1e-3
 
 
@@ -102,7 +103,7 @@ def sample_posterior(
 
     def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
         """Centres and the covariance of the next round."""
-        weight = flattened(_log_weights(done), LEAST_EFFECTIVE)
+        weight = flattened(_log_weights(done), PLACED_EFFECTIVE)
         mean, about = _moments(done.known.place, weight)
         likely = drawn_evenly(done.known.place.reshape(-1, 3), weight.reshape(-1), per_round)
         wide = jnp.arange(per_round)[:, None] % len(SCALES) < ABOUT_MEAN

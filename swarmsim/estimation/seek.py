@@ -28,7 +28,7 @@ REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; 
 CLOSING = 0.55  # reach of a later round over that of the one before
 NAMED_AGAIN = 3  # of those rounds, after which nuclides are compared again: from 6 m it is known to a metre then
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
-HOPELESS = 0.4  # of the threshold: the ratio at the best of some starts below which no further round is worth while
+HOPELESS = 0.4  # of what a source must reach: the ratio at the best of some starts below which no further round is worth while
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
 
@@ -72,8 +72,7 @@ def sought(
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
         # what is sought again stays where it is rather than at a place that explains much less
-        least = jnp.where(jnp.any(s.present), params.further, params.threshold)
-        found = ratio > jnp.where(adding, least, -HOPELESS * params.further)
+        found = ratio > jnp.where(adding, least_of(params, state), -HOPELESS * params.further)
         after = with_source(problem, state, slot, best)
         table = after.sources.nuclide_value.at[slot].set(values)
         after = replace(after, sources=replace(after.sources, nuclide_value=table))
@@ -81,6 +80,11 @@ def sought(
 
     worth = ~adding | (statistic > PROMISING * params.threshold)
     return for_those(worth, look, lambda: (state, jnp.array(False)), IN_STEP)
+
+
+def least_of(params: SearchParams, state: State) -> jax.Array:
+    """Twice the logarithm of the likelihood ratio [] that a further source must reach beside those of ``state``."""
+    return jnp.where(jnp.any(state.sources.present), params.further, params.threshold)
 
 
 def _best(
@@ -176,7 +180,7 @@ def _best(
     def on(carry: _Rounds) -> jax.Array:
         number, best, *_ = carry
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
-        hopeless = adding & (number >= BEGINNINGS) & (ratio < HOPELESS * params.threshold)
+        hopeless = adding & (number >= BEGINNINGS) & (ratio < HOPELESS * least_of(params, state))
         return (number < reaches.shape[0]) & ~hopeless
 
     start = (first, as_known(problem, state, slot, adding), jnp.zeros(known), jnp.array(True))

@@ -248,6 +248,7 @@ def roi_rates_and_slopes(
     by: tuple[int, ...] = (),
     weight: jax.Array | None = None,
     places: int = 1,
+    asked: jax.Array | bool = True,
 ) -> RoiRates:
     """`roi_rates` with their derivatives at n places, or sums of them over some places at a time.
 
@@ -262,6 +263,7 @@ def roi_rates_and_slopes(
         by: numbers of U materials (static).
         weight: [n] of the places in the sums; 1 by default.
         places: in a sum, neighbours (static).
+        asked: [] bool; where it is False all rates are zero, for next to nothing.
     """
     given = jnp.ones(axis.shape[0]) if weight is None else weight
     lines = _lines_of(detector, source.nuclide)
@@ -274,6 +276,7 @@ def roi_rates_and_slopes(
     m, together = n // places, 1 if on_processor() else LINES_TOGETHER
     # most nuclides have fewer lines than the tables have rows
     count = jnp.max(jnp.where(detector.yields[source.nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
+    count = jnp.where(asked, count, 0)
     nothing = RoiRates(jnp.zeros((m, regions)), jnp.zeros((m, len(by), regions)), jnp.zeros(n))
 
     def add(number: jax.Array, sums: RoiRates) -> RoiRates:

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from swarmsim.device import at_most
 from swarmsim.pytree import pytree
@@ -108,14 +109,28 @@ class Way:
 
 
 def shaped(
-    boxes: Obstacles, of_metre: jax.Array, a: jax.Array, b: jax.Array, way: Way, size: int | None = None
+    boxes: Obstacles,
+    of_metre: jax.Array,
+    a: jax.Array,
+    b: jax.Array,
+    way: Way,
+    size: int | None = None,
+    like: np.ndarray | None = None,
 ) -> Crossed:
     """``way`` [n] from ``a`` [n, 3] to ``b`` [n, 3] with its shape; ``of_metre`` are the `walls_of_materials`.
 
-    With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together.
+    With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together. ``like``
+    [n] (static) are numbers of segments beside which they are: a box that both meet in the same turn scatters for one
+    as for the other.
     """
     a, b, n = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b), b.shape[0]
     keys = jnp.concatenate([way.met.first, way.met.second, way.met.third])
+    wanted, source = keys > 0, None
+    if like is not None and size is not None:
+        every = np.concatenate([like, like + n, like + 2 * n])
+        # the upper half grows with the matter, which differs
+        alike = ((keys ^ keys[every]) & ~_UPPER == 0) & wanted & wanted[every] & (every != np.arange(3 * n))
+        wanted, source = wanted & ~alike, jnp.where(alike, every, jnp.arange(3 * n))
 
     def of(pair: jax.Array) -> jax.Array:
         """Length the short way, coefficients, closed, and walls less 1 [OUTPUTS + 3, k] of pairs [k]."""
@@ -123,7 +138,8 @@ def shaped(
         of_photons, around = scattered(_box(boxes, keys[pair], a[row], b[row]))
         return jnp.concatenate([around.thin_m[None], of_photons, around.closed[None], around.walls[None] - 1.0])
 
-    each = (of(jnp.arange(3 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 3, n)
+    every_pair = of(jnp.arange(3 * n)) if size is None else _packed(of, wanted, size, source)
+    each = every_pair.reshape(-1, 3, n)
     matter = jnp.where(keys > 0, each[0].reshape(-1) * of_metre[_row(boxes.material, keys)], 0.0).reshape(3, n)
     # What is left may be a box that is about to change places with the third, which then has no weight of its own but
     # this small one, for boxes that are all alike.
@@ -139,8 +155,13 @@ def shaped(
     return replace(way.crossed, shape=shape)
 
 
-def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int) -> jax.Array:
-    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; of the others anything."""
+def _packed(
+    function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int, source: jax.Array | None = None
+) -> jax.Array:
+    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; of the others anything.
+
+    With a ``source`` [n] each gets what that number would.
+    """
     n, place = wanted.shape[0], jnp.cumsum(wanted.astype(jnp.int32)) - 1
     size = min(size, n)
     rows = jnp.zeros(n + size, jnp.int32).at[jnp.where(wanted, place, n + size)].set(jnp.arange(n), mode="drop")
@@ -151,7 +172,7 @@ def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size:
         return jax.lax.dynamic_update_slice(found, own, (jnp.zeros_like(first), first))
 
     found = jax.lax.fori_loop(0, at_most(-(-(place[-1] + 1) // size)), step, jnp.zeros((OUTPUTS + 3, n + size)))
-    return found[:, jnp.maximum(place, 0)]
+    return found[:, jnp.maximum(place if source is None else place[source], 0)]
 
 
 def _box(boxes: Obstacles, key: jax.Array, a: jax.Array, b: jax.Array) -> Box:
