@@ -28,7 +28,7 @@ REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; 
 CLOSING = 0.55  # reach of a later round over that of the one before
 NAMED_AGAIN = 3  # of those rounds, after which nuclides are compared again: from 6 m it is known to a metre then
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
-HOPELESS = 0.4  # of what a source must reach: the ratio at the best of some starts below which no further round is worth while
+HOPELESS = 0.4  # of what a source must reach: the ratio at the best of some starts, below which it is given up
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
 
@@ -60,7 +60,6 @@ def sought(
     wide: jax.Array,
 ) -> tuple[State, jax.Array]:
     """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one."""
-    s = state.sources
     others = without(state, slot).added
     starts, statistic = for_those(
         adding | wide,

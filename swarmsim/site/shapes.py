@@ -18,6 +18,8 @@ from swarmsim.site.surfaces import Box
 from swarmsim.site.wall_network import OUTPUTS, scattered
 
 _UPPER = -(1 << 16)  # mask of a number's upper half
+NEXT = 0.1
+"""Distance of the ends of two segments from one place over their length, up to which boxes scatter alike for both."""
 ALIKE = 0.05
 """Weight of a box beside three others of the same matter, over that of a box alone."""
 
@@ -120,16 +122,18 @@ def shaped(
     """``way`` [n] from ``a`` [n, 3] to ``b`` [n, 3] with its shape; ``of_metre`` are the `walls_of_materials`.
 
     With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together. ``like``
-    [n] (static) are numbers of segments beside which they are: a box that both meet in the same turn scatters for one
-    as for the other.
+    [n] (static) are numbers of segments next to them: a box that both meet in the same turn scatters for one as for the
+    other, where their ends are `NEXT` to one another.
     """
     a, b, n = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b), b.shape[0]
     keys = jnp.concatenate([way.met.first, way.met.second, way.met.third])
     wanted, source = keys > 0, None
     if like is not None and size is not None:
         every = np.concatenate([like, like + n, like + 2 * n])
+        apart2 = jnp.sum(jnp.square(b - b[like]), axis=1)
+        next_ = (apart2 <= NEXT**2 * jnp.sum(jnp.square(b - a), axis=1)) & (like != np.arange(n))
         # the upper half grows with the matter, which differs
-        alike = ((keys ^ keys[every]) & ~_UPPER == 0) & wanted & wanted[every] & (every != np.arange(3 * n))
+        alike = ((keys ^ keys[every]) & ~_UPPER == 0) & wanted & wanted[every] & jnp.tile(next_, 3)
         wanted, source = wanted & ~alike, jnp.where(alike, every, jnp.arange(3 * n))
 
     def of(pair: jax.Array) -> jax.Array:
