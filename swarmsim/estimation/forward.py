@@ -145,20 +145,13 @@ def ways_from(problem: Problem, place: jax.Array) -> Ways:
     wanted = jnp.concatenate([jnp.repeat(valid[first:last], rays) for first, last, _, rays in problem.spans])
     ends = jnp.concatenate([nodes.position_m for nodes in problem.nodes])
     # of all spans at once: it is compiled at several places
-    every = crossed_from(problem.site, position, ends, wanted, _middles(problem.spans))
+    every = crossed_from(problem.site, position, ends, wanted)
     rows = np.cumsum([0, *(nodes.position_m.shape[0] for nodes in problem.nodes)])
     crossed = tuple(
         jax.tree.map(lambda x, part=slice(first, last): x[part], every)
         for first, last in itertools.pairwise(rows.tolist())
     )
     return Ways(crossed=crossed, position_m=position)
-
-
-def _middles(spans: tuple[Span, ...]) -> np.ndarray:
-    """For each ray the number of the middle one of its window."""
-    windows = np.concatenate([np.repeat([rays], last - first) for first, last, _, rays in spans])
-    first = np.cumsum(windows) - windows
-    return np.repeat(first + windows // 2, windows)
 
 
 @jax.jit  # traced once for all places of a program that call it

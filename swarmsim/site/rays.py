@@ -120,20 +120,15 @@ def mirrored(a: jax.Array, b: jax.Array, one: jax.Array, other: jax.Array) -> ja
     return ratio * jnp.stack([root, u])
 
 
-def crossed_from(
-    site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None, like: np.ndarray | None = None
-) -> Crossed:
+def crossed_from(site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None) -> Crossed:
     """`crossed` [n] of the segments from ``a`` [3] to each of ``b`` [n, 3], in the way that suits the device.
 
-    Those not ``wanted`` [n] need not be followed: some of them come out as crossing nothing, of no length. ``like`` [n]
-    (static) are numbers of ends next to them: what walls scatter is computed once where both meet the same boxes.
+    Those not ``wanted`` [n] need not be followed: what comes out of them means nothing.
     """
-    return _in_blocks(site, a, b, wanted, like) if on_processor() else by_threads(site, a, b, None, wanted, like)
+    return _in_blocks(site, a, b, wanted) if on_processor() else by_threads(site, a, b, wanted)
 
 
-def _in_blocks(
-    site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None, like: np.ndarray | None = None
-) -> Crossed:
+def _in_blocks(site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None) -> Crossed:
     """In blocks of neighbouring ends; clusters of boxes that none of a block's segments comes near are left out.
 
     Of the boxes of a cluster, those that a segment meets are taken one after another, for all segments of the block at
@@ -172,7 +167,7 @@ def _in_blocks(
             lambda x: jax.lax.cond(jnp.any(x[1]), block, lambda _: unseen, x[0]), (ends, parts)
         )  # fmt: skip
     ways = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], ways)
-    return shaped(every, walls_of_materials(site), jnp.broadcast_to(a, b.shape), b, ways, PAIRS, like)
+    return shaped(every, walls_of_materials(site), jnp.broadcast_to(a, b.shape), b, ways, PAIRS)
 
 
 def _met(
@@ -270,12 +265,7 @@ def _near(boxes: Obstacles, a: jax.Array, ends: jax.Array) -> jax.Array:
 
 
 def by_threads(
-    site: Site,
-    a: jax.Array,
-    b: jax.Array,
-    platform: str | None = None,
-    wanted: jax.Array | None = None,
-    like: np.ndarray | None = None,
+    site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None, platform: str | None = None
 ) -> Crossed:
     """`crossed_from` with a thread for each segment, which goes through the boxes and over the terrain by itself.
 
@@ -302,7 +292,7 @@ def by_threads(
     )
     if wanted is not None:
         ways = replace(ways, met=jax.tree.map(lambda key: jnp.where(wanted, key, 0), ways.met))
-    return shaped(site.obstacles, of_metre, starts, b, ways, PAIRS_OF_MANY, like)
+    return shaped(site.obstacles, of_metre, starts, b, ways, PAIRS_OF_MANY)
 
 
 @pytree

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from swarmsim.device import at_most
 from swarmsim.pytree import pytree
@@ -18,8 +17,6 @@ from swarmsim.site.surfaces import Box
 from swarmsim.site.wall_network import OUTPUTS, scattered
 
 _UPPER = -(1 << 16)  # mask of a number's upper half
-NEXT = 0.1
-"""Distance of the ends of two segments from one place over their length, up to which boxes scatter alike for both."""
 ALIKE = 0.05
 """Weight of a box beside three others of the same matter, over that of a box alone."""
 
@@ -111,30 +108,14 @@ class Way:
 
 
 def shaped(
-    boxes: Obstacles,
-    of_metre: jax.Array,
-    a: jax.Array,
-    b: jax.Array,
-    way: Way,
-    size: int | None = None,
-    like: np.ndarray | None = None,
+    boxes: Obstacles, of_metre: jax.Array, a: jax.Array, b: jax.Array, way: Way, size: int | None = None
 ) -> Crossed:
     """``way`` [n] from ``a`` [n, 3] to ``b`` [n, 3] with its shape; ``of_metre`` are the `walls_of_materials`.
 
-    With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together. ``like``
-    [n] (static) are numbers of segments next to them: a box that both meet in the same turn scatters for one as for the
-    other, where their ends are `NEXT` to one another.
+    With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together.
     """
     a, b, n = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b), b.shape[0]
     keys = jnp.concatenate([way.met.first, way.met.second, way.met.third])
-    wanted, source = keys > 0, None
-    if like is not None and size is not None:
-        every = np.concatenate([like, like + n, like + 2 * n])
-        apart2 = jnp.sum(jnp.square(b - b[like]), axis=1)
-        next_ = (apart2 <= NEXT**2 * jnp.sum(jnp.square(b - a), axis=1)) & (like != np.arange(n))
-        # the upper half grows with the matter, which differs
-        alike = ((keys ^ keys[every]) & ~_UPPER == 0) & wanted & wanted[every] & jnp.tile(next_, 3)
-        wanted, source = wanted & ~alike, jnp.where(alike, every, jnp.arange(3 * n))
 
     def of(pair: jax.Array) -> jax.Array:
         """Length the short way, coefficients, closed, and walls less 1 [OUTPUTS + 3, k] of pairs [k]."""
@@ -142,8 +123,7 @@ def shaped(
         of_photons, around = scattered(_box(boxes, keys[pair], a[row], b[row]))
         return jnp.concatenate([around.thin_m[None], of_photons, around.closed[None], around.walls[None] - 1.0])
 
-    every_pair = of(jnp.arange(3 * n)) if size is None else _packed(of, wanted, size, source)
-    each = every_pair.reshape(-1, 3, n)
+    each = (of(jnp.arange(3 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 3, n)
     matter = jnp.where(keys > 0, each[0].reshape(-1) * of_metre[_row(boxes.material, keys)], 0.0).reshape(3, n)
     # What is left may be a box that is about to change places with the third, which then has no weight of its own but
     # this small one, for boxes that are all alike.
@@ -159,13 +139,8 @@ def shaped(
     return replace(way.crossed, shape=shape)
 
 
-def _packed(
-    function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int, source: jax.Array | None = None
-) -> jax.Array:
-    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; of the others anything.
-
-    With a ``source`` [n] each gets what that number would.
-    """
+def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int) -> jax.Array:
+    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; of the others anything."""
     n, place = wanted.shape[0], jnp.cumsum(wanted.astype(jnp.int32)) - 1
     size = min(size, n)
     rows = jnp.zeros(n + size, jnp.int32).at[jnp.where(wanted, place, n + size)].set(jnp.arange(n), mode="drop")
@@ -176,7 +151,7 @@ def _packed(
         return jax.lax.dynamic_update_slice(found, own, (jnp.zeros_like(first), first))
 
     found = jax.lax.fori_loop(0, at_most(-(-(place[-1] + 1) // size)), step, jnp.zeros((OUTPUTS + 3, n + size)))
-    return found[:, jnp.maximum(place if source is None else place[source], 0)]
+    return found[:, jnp.maximum(place, 0)]
 
 
 def _box(boxes: Obstacles, key: jax.Array, a: jax.Array, b: jax.Array) -> Box:

@@ -195,7 +195,7 @@ def test_a_thread_for_each_segment_crosses_the_same():
     expected = jax.jit(jax.vmap(lambda a: crossed_from(site, a, ends)))(starts)
 
     def all_threads(site, starts):
-        return jax.vmap(lambda a: by_threads(site, a, ends, "gpu, interpreted"))(starts)
+        return jax.vmap(lambda a: by_threads(site, a, ends, platform="gpu, interpreted"))(starts)
 
     assert str(jax.make_jaxpr(all_threads)(site, starts)).count("pallas_call[") == 1
     found = jax.jit(all_threads)(site, starts)
@@ -280,34 +280,6 @@ def share_of(shape):
 def shape_of(site, a, b):
     way = crossed_of(site, jnp.array(a, jnp.float32), jnp.array(b, jnp.float32))
     return float(way.length_m[CONCRETE]), float(way.shape.thin_m[CONCRETE]), way.shape
-
-
-def test_walls_scatter_alike_for_ends_next_to_one_another():
-    """Ends beside a middle one: where they are near as seen from the source, and meet the same boxes, its value."""
-    site = make_site([((0.0, 0.0, 1.0), (2.0, 2.0, 2.0), 0.3, 0.2, "concrete"), ((9.0, 8.0, 4.0), (1.0, 1.0, 6.0), 0.0, 0.0, "brick")])  # fmt: skip
-    start = jnp.array([0.3, 0.2, 0.5])
-    bearing = np.arange(0.0, 2.0 * np.pi, 0.25)
-    middle = np.stack([30.0 * np.cos(bearing), 30.0 * np.sin(bearing), np.full_like(bearing, 15.0)], axis=1)
-    across = np.stack([-np.sin(bearing), np.cos(bearing), np.zeros_like(bearing)], axis=1)
-    like = np.repeat(3 * np.arange(len(bearing)) + 1, 3)
-
-    def ways(off_m, like=None):
-        ends = jnp.asarray(np.stack([middle - off_m * across, middle, middle + off_m * across], axis=1).reshape(-1, 3))
-        return jax.jit(lambda a, b: crossed_from(site, a, b, None, like))(start, ends)
-
-    near, alike, far = ways(3.0), ways(3.0, like), ways(4.0, like)
-    scattered, shared = (np.asarray(x.shape.scattered).reshape(-1, 3, OUTPUTS) for x in (near, alike))
-    same = np.all(shared == shared[:, 1:2], axis=2)
-    assert 0.6 < np.mean(same[:, [0, 2]]) < 1.0  # one of some meets the other box, or a corner more
-    assert not np.all(scattered == scattered[:, 1:2], axis=2)[:, [0, 2]].any()
-    np.testing.assert_allclose(shared[~same], scattered[~same], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(shared[:, 1], scattered[:, 1], rtol=1e-4, atol=1e-5)
-    for name in ("length_m", "place"):
-        np.testing.assert_array_equal(getattr(alike, name), getattr(near, name))
-    # so far apart each has its own
-    np.testing.assert_allclose(far.shape.scattered, ways(4.0).shape.scattered, rtol=1e-4, atol=1e-4)
-    # ends on both sides differ from the middle one by opposite amounts
-    np.testing.assert_allclose(np.mean(shared[..., 0], axis=1), np.mean(scattered[..., 0], axis=1), atol=0.02)
 
 
 def test_the_short_way_through_a_wall_and_what_is_seen_of_it():
