@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmsim.config.files import packaged_dir
+from swarmsim.scalars.graph import varying_axes
+from swarmsim.site import network_kernel
 from swarmsim.site.surfaces import FEATURES, Box, Surroundings, surroundings
 
 DEPTHS = (0.25, 0.75, 2.25, 6.75, 20.25)
@@ -89,11 +91,13 @@ def scattered(box: Box, net: Network | None = None) -> tuple[jax.Array, Surround
 
 def outputs(features: jax.Array, net: Network | None = None) -> jax.Array:
     """[OUTPUTS, n] of features [FEATURES, n]."""
-    net = net or network()
+    fixed, net = net is None, net or network()
     low, high, middle, scale = (jnp.asarray(x)[:, None] for x in net[:4])
     x = (jnp.clip(features, low, high) - middle) / scale
+    if fixed and jax.default_backend() == "gpu" and network_kernel.suits(x) and not varying_axes(x):
+        return network_kernel.evaluated(x, net.weights, net.biases)
     for number, (weights, biases) in enumerate(zip(net.weights, net.biases, strict=True)):
         if number:
-            x = 0.5 * (x + jnp.sqrt(x * x + 1.0))
+            x = network_kernel.squareplus(x)
         x = jnp.matmul(jnp.asarray(weights), x, precision=jax.lax.Precision.HIGHEST) + jnp.asarray(biases)[:, None]
     return x
