@@ -28,8 +28,8 @@ def evaluated(
 ) -> jax.Array:
     """Outputs [outputs, n] of features [inputs, n] within their range, n being what `suits`.
 
-    ``weights`` and ``biases`` are those of `swarmsim.site.wall_network.Network`. Without derivatives. ``interpret`` runs
-    the kernel without a GPU, for tests.
+    ``weights`` and ``biases`` are those of `swarmsim.site.wall_network.Network`. There are no derivatives. With
+    ``interpret`` the kernel runs without a GPU, for tests.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton

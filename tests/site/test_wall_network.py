@@ -1,10 +1,12 @@
 """The network of walls: its table, and what keeps it from telling nonsense."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from swarmsim.radiation.walls import MOST
+from swarmsim.site import network_kernel
 from swarmsim.site.surfaces import FEATURES, Box
 from swarmsim.site.wall_network import COEFFICIENTS, DEPTHS, OUTPUTS, network, network_of, outputs, scattered, table_of
 
@@ -34,6 +36,32 @@ def test_its_layers_are_those_of_the_formula():
             x = 0.5 * (x + np.sqrt(x * x + 1.0))
         x = x @ weights.T.astype(float) + biases
     np.testing.assert_allclose(outputs(jnp.asarray(features.T)).T, x, atol=2e-3)
+
+
+def in_kernel(features, **interpreted):
+    """Of features [.., FEATURES, n] as they are within their range."""
+    net = network()
+    x = (features - net.middle[:, None]) / net.scale[:, None]
+
+    def of(x):
+        return network_kernel.evaluated(x, net.weights, net.biases, **interpreted)
+
+    return jax.vmap(jax.vmap(of))(x)
+
+
+def test_its_kernel_computes_the_same():
+    """For several missions and places, as in an estimate."""
+    net, rng = network(), np.random.default_rng(4)
+    shape = (2, 3, 2 * network_kernel.COLUMNS, len(FEATURES))
+    features = jnp.asarray(np.swapaxes(rng.uniform(net.low, net.high, shape), 2, 3), jnp.float32)
+    found = jax.jit(lambda x: in_kernel(x, interpret=True))(features)
+    expected = jax.vmap(jax.vmap(outputs))(features)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
+    assert network_kernel.suits(features[0, 0])
+    assert not network_kernel.suits(features[0, 0, :, 1:])
+    # what a GPU is given
+    lowered = jax.jit(in_kernel).trace(features).lower(lowering_platforms=("cuda",)).as_text()
+    assert lowered.count("__gpu$xla.gpu.triton") == 1
 
 
 def test_what_is_beyond_all_that_it_was_fitted_to_is_as_at_the_end():
