@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from swarmsim.radiation import Detector, rate, roi_rates, spectrum_rate
-from swarmsim.radiation.detector import AIR
-from swarmsim.radiation.rate import from_ground, line_rates, roi_rates_and_slopes, transmission
+from swarmsim.radiation.detector import AIR, Source
+from swarmsim.radiation.rate import RoiRates, from_ground, line_rates, roi_rates_and_slopes, transmission
 from swarmsim.radiation.walls import MOST
 from swarmsim.site import Crossed
 from swarmsim.site.rays import Shape, stretched
@@ -100,6 +100,14 @@ def test_an_accelerator_takes_some_lines_at_a_time(detectors: Detectors, monkeyp
     for number, one in enumerate(alone):
         for x, y in zip(found, one, strict=True):
             np.testing.assert_allclose(x[number], y, rtol=2e-5, atol=1e-6 * float(jnp.max(jnp.abs(y))))
+    asked = jnp.array([True, False, True])  # one of them for nothing
+
+    def some(source: Source, asked: jax.Array) -> RoiRates:
+        return roi_rates_and_slopes(d, source, way, places, axes, by, asked=asked)
+
+    for one, other in zip(jax.vmap(some)(every, asked), found, strict=True):
+        np.testing.assert_allclose(one[asked], other[asked], rtol=1e-6)
+    assert not any(jnp.any(x) for x in some(sources[1], jnp.array(False)))
 
 
 @pytest.mark.parametrize("walls", [1.0, 2.0])

@@ -270,6 +270,10 @@ def test_what_is_wanted_is_crossed_as_if_all_were():
     assert np.all(np.asarray(some.length_m)[between] == 0.0)
     assert np.all(np.asarray(some.shape.scattered)[between] == 0.0)
     assert np.all(np.asarray(every.length_m)[between, CONCRETE] > 0.9)
+    threads = jax.jit(lambda wanted: by_threads(site, start, ends, wanted, "gpu, interpreted"))(wanted)
+    for one, other in zip(jax.tree.leaves(threads), jax.tree.leaves(every), strict=True):
+        np.testing.assert_allclose(np.asarray(one)[wanted], np.asarray(other)[wanted], rtol=1e-4, atol=1e-4)
+    assert np.all(np.asarray(threads.shape.scattered)[~wanted] == 0.0)
 
 
 def share_of(shape):
