@@ -77,7 +77,6 @@ def _height(rows: int) -> int:
 
 
 def _filled(values: Any, shape: tuple[int, int]) -> np.ndarray:
-    """Values in the corner of zeros."""
-    filled = np.zeros(shape, np.float32)
-    filled[: len(values), : len(values[0])] = values
-    return filled
+    """Values [rows, columns] with zeros after them."""
+    values = np.asarray(values, np.float32)
+    return np.pad(values, [(0, whole - part) for whole, part in zip(shape, values.shape, strict=True)])

@@ -67,6 +67,22 @@ def test_a_normal_posterior_has_its_mean_and_covariance(seed, wrong):
     assert float(found.halves) < 0.4
 
 
+def test_rounds_close_in_on_what_is_much_narrower_than_promised():
+    """As behind walls, where the curvature promises a posterior that is five times as wide: in seven rounds of 24."""
+    mean, std = np.array([1.0, 2.0, 0.5]), np.array([0.25, 0.35, 0.2])
+    zero = jnp.zeros(())
+
+    def weigh(place):
+        off = (place - mean) / std
+        return Weighed(place=place, log_activity=zero, variance=zero, log_posterior=-0.5 * jnp.sum(jnp.square(off)))
+
+    start, guess = jnp.array([1.3, 1.7, 0.6]), jnp.diag(jnp.square(jnp.array([2.0, 1.6, 0.8])))
+    found = jax.jit(lambda: sample_posterior(weigh, start, guess, 7, 24))()
+    assert float(found.effective) >= 40.0
+    np.testing.assert_allclose(found.mean[:3], mean, atol=0.2 * std.max())
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance)[:3]), std, rtol=0.15)
+
+
 def test_two_halves_that_disagree_are_told():
     """All of the posterior in a hair's breadth far from the start: the few places that come near it settle nothing."""
 

@@ -13,6 +13,7 @@ from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
 from swarmsim.estimation.search import Screen, Tried, _own, attempt, spread_along
+from swarmsim.estimation.seek import least_of
 from swarmsim.estimation.seek import sought as seek
 from swarmsim.estimation.state import no_sources, settled, signals
 from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spec, spectrometer, survey
@@ -136,3 +137,12 @@ def test_a_window_s_gain_has_the_spectrum_of_the_nuclide_that_is_asked_for():
     np.testing.assert_allclose(
         mine[1], (source[::-1] * source.sum(0) / source[::-1].sum(0) + others) * registered, rtol=1e-5
     )
+
+
+def test_a_further_source_must_explain_more_than_the_first():
+    known, m = told([])
+    params = localisation_params(spec(sources_max=2)).search
+    nothing = no_sources(problem_of(known, m, SPANS), 2, len(NUCLIDES))
+    one = replace(nothing, sources=replace(nothing.sources, present=jnp.array([False, True])))
+    assert float(least_of(params, nothing)) == float(params.threshold)
+    assert float(least_of(params, one)) == float(params.further) > float(params.threshold)

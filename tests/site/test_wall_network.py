@@ -64,6 +64,31 @@ def test_its_kernel_computes_the_same():
     assert lowered.count("__gpu$xla.gpu.triton") == 1
 
 
+def test_a_gpu_takes_whole_blocks_to_the_kernel(monkeypatch):
+    """Of the project's network; another one, which may be a traced one that is fitted, goes the other way."""
+    net, rng, taken = network(), np.random.default_rng(5), []
+    evaluated = network_kernel.evaluated
+
+    def interpreted(x, weights, biases):
+        taken.append(x.shape[1])
+        return evaluated(x, weights, biases, interpret=True)
+
+    whole = 2 * network_kernel.COLUMNS
+    # some of them beyond its range
+    features = jnp.asarray(rng.uniform(net.low, 1.5 * net.high, (whole, len(FEATURES))).T, jnp.float32)
+    expected = outputs(features)
+    monkeypatch.setattr(network_kernel, "evaluated", interpreted)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    np.testing.assert_allclose(outputs(features), expected, rtol=1e-4, atol=1e-3)
+    assert taken == [whole]
+    for found in (
+        outputs(features, net),
+        jnp.concatenate([outputs(features[:, :1]), outputs(features[:, 1:])], axis=1),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-3)
+    assert taken == [whole]
+
+
 def test_what_is_beyond_all_that_it_was_fitted_to_is_as_at_the_end():
     net = network()
     beyond = net.high + 1e3 * (net.high - net.low)
