@@ -20,9 +20,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Of the workers and of the programs that tests start: a compiler's millions of small objects are taken from and put
 # back on lists of each thread, and not merged with their neighbours at once.
 os.environ.setdefault("GLIBC_TUNABLES", "glibc.malloc.tcache_count=65535")
-# Most of the suite's time is compilation. Without LLVM's second level, and with the older emitter of loops where there
-# is the choice, it takes half as long, and what is tested runs as fast.
-_FLAGS = ["--xla_backend_optimization_level=1"]
+# Most of the suite's time is compilation. Without LLVM's second level, without the passes over loops that copy their
+# bodies again and again, and with the older emitter of loops where there is the choice, it takes a third as long, and
+# what is tested runs as fast.
+_FLAGS = [
+    "--xla_backend_optimization_level=1",
+    "--xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops",
+    "--xla_cpu_parallel_codegen_split_count=1",
+]
 if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
     _FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
@@ -68,6 +73,9 @@ _FIRST = (
     "world/test_transforms.py",
 )
 
+# Flights in real time, which wait most of the time: one worker more than there are cores does so beside the others.
+_WAITING = "tests/autopilot/"
+
 # Files that share what takes long to make stay with one worker.
 _SHARING = {"tests/estimation/test_pairs.py": "tests/estimation/test_localise.py"}
 
@@ -89,12 +97,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: place.get(item.path, len(place)))
 
 
+def pytest_configure() -> None:
+    """Workers that compute make way for the one whose flights keep time."""
+    worker, count = os.environ.get("PYTEST_XDIST_WORKER", ""), int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if worker and worker != f"gw{count - 1}":
+        os.nice(5)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Files go to workers as a whole, those of `_SHARING` together."""
+    """Files go to workers as a whole, those of `_SHARING` together; the last worker has those of `_WAITING` first."""
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):
+        def _assign_work_unit(self, node: Any) -> None:
+            last = len(self.nodes) > 1 and node is self.nodes[-1]
+            preferred = next((file for file in self.workqueue if file.startswith(_WAITING) == last), None)
+            if preferred is not None:
+                self.workqueue.move_to_end(preferred, last=False)
+            super()._assign_work_unit(node)
+
         def _split_scope(self, nodeid: str) -> str:
             file = super()._split_scope(nodeid)
             return _SHARING.get(file, file)
