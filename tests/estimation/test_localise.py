@@ -13,8 +13,6 @@ from swarmsim.estimation.localise import sampled
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
-pytestmark = pytest.mark.optimised
-
 SITE = place(NOWHERE)
 DRAWS = 32
 CERTAIN = Knowledge(site="exact", background_std=0.01, model_std=0.001)
