@@ -90,13 +90,14 @@ def fly(params, state, commands, *, steps=None, wind=CALM, ground=None, name="ta
     return jax.tree.map(lambda *blocks: np.concatenate(blocks), *parts)
 
 
-@partial(jax.jit, static_argnames=("setpoint_at", "name", "engine", "ticks", "gusts"))
-def _controlled(params, state, ground, wind_m_s, seed, setpoint_at, name, engine, ticks, gusts):
+@partial(jax.jit, static_argnames=("name", "engine", "gusts"))
+def _controlled(params, state, ground, wind_m_s, seed, setpoints, name, engine, gusts):
     step = make_multirotor_step(engine, DT)
 
-    def tick(carry, k):
+    def tick(carry, now):
         state, memory, gust = carry
-        command, memory = control(params, memory, state, setpoint_at(2 * DT * k), 2 * DT)
+        k, setpoint = now
+        command, memory = control(params, memory, state, setpoint, 2 * DT)
         height = state.body.position_m[2]
         wind = steady_wind(wind_m_s, 4.2, height)
         if gusts:
@@ -115,7 +116,8 @@ def _controlled(params, state, ground, wind_m_s, seed, setpoint_at, name, engine
         return (state, memory, gust), (state, memory, command)
 
     start = (state, control_start(), gust_start(jax.random.normal(jax.random.key(seed + 1000), (GUST_NOISE,))))
-    return jax.lax.scan(tick, start, jnp.arange(ticks))[1]
+    ticks = jax.tree.leaves(setpoints)[0].shape[0]
+    return jax.lax.scan(tick, start, (jnp.arange(ticks), setpoints))[1]
 
 
 def fly_controlled(
@@ -134,15 +136,12 @@ def fly_controlled(
     """States, controller memories and commands every 10 ms (numpy) of a flight along ``setpoint_at(time_s)``."""
     ground = ground or plane()
     state = rest_state(params, ground, 0.0) if state is None else state
-    run = partial(
-        _controlled,
-        setpoint_at=setpoint_at,
-        name=name,
-        engine=engine or "analytic",
-        ticks=round(seconds / (2 * DT)),
-        gusts=gusts,
+    # values, so that flights along other ways are flown by the same program
+    setpoints = jax.jit(jax.vmap(setpoint_at))(2 * DT * jnp.arange(round(seconds / (2 * DT))))
+    flown = _controlled(
+        params, state, ground, jnp.float32(wind), seed, setpoints, name=name, engine=engine or "analytic", gusts=gusts
     )
-    return jax.tree.map(np.asarray, run(params, state, ground, jnp.float32(wind), seed))
+    return jax.tree.map(np.asarray, flown)
 
 
 def attitude(q):
