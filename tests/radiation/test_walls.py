@@ -18,6 +18,8 @@ from tests.radiation.points import point, through
 
 Detectors = dict[tuple[str, str], Detector]
 PLACE, UP = jnp.array([0.0, 0.0, 10.0]), jnp.array([0.0, 0.0, 1.0])
+slopes_of = jax.jit(roi_rates_and_slopes, static_argnames=("by",))
+transmitted = jax.jit(transmission)
 
 
 def shaped(
@@ -36,7 +38,7 @@ def shaped(
 
 
 def scattered(detector: Detector, way: Crossed, nuclide: str = "Cs-137") -> np.ndarray:
-    return np.asarray(transmission(detector, jnp.int32(detector.nuclide_names.index(nuclide)), way)[1])
+    return np.asarray(transmitted(detector, jnp.int32(detector.nuclide_names.index(nuclide)), way)[1])
 
 
 def test_a_wide_wall_that_is_crossed_squarely_is_a_slab(detectors: Detectors) -> None:
@@ -61,8 +63,8 @@ def test_no_wall_makes_much_more_of_a_source(detectors: Detectors) -> None:
             way = shaped(through(d, concrete=metres), share=1e12, walls=walls)
             assert scattered(d, way).max() < 1.001 * MOST
             assert metres > 1.0 or scattered(d, way).max() > 0.999 * MOST
-            _, slopes, _ = roi_rates_and_slopes(
-                d, point(d, "Cs-137"), jax.tree.map(lambda x: x[None], way), PLACE[None], UP[None], (0,)
+            _, slopes, _ = slopes_of(
+                d, point(d, "Cs-137"), jax.tree.map(lambda x: x[None], way), PLACE[None], UP[None], by=(0,)
             )  # fmt: skip
             assert np.isfinite(slopes).all()
 
@@ -76,7 +78,7 @@ def test_derivatives_are_numbers_for_nuclides_of_few_lines_as_well(detectors: De
     by = tuple(d.material_names.index(name) for name in ("concrete", AIR))
     assert float(jnp.min(jnp.sum(d.yields > 0.0, axis=1))) < d.yields.shape[1]
     for nuclide in d.nuclide_names:
-        rates, slopes, _ = roi_rates_and_slopes(d, point(d, nuclide), way, places, axes, by)
+        rates, slopes, _ = slopes_of(d, point(d, nuclide), way, places, axes, by=by)
         assert np.isfinite(rates).all()
         assert np.isfinite(slopes).all()
         assert np.any(np.asarray(slopes[1, 0]) != 0.0)
@@ -171,7 +173,7 @@ def test_derivatives_by_the_thickness_are_those_of_the_counts(
         more = [stretched(way, jnp.ones(len(d.material_names)).at[concrete].set(f)) for f in (0.99, 1.01)]
         places, axes = PLACE[None], UP[None]
         one = lambda w: jax.tree.map(lambda x: x[None], w)  # noqa: E731
-        rates = [roi_rates_and_slopes(d, point(d, "Cs-137"), one(w), places, axes, (concrete,)) for w in (way, *more)]
+        rates = [slopes_of(d, point(d, "Cs-137"), one(w), places, axes, by=(concrete,)) for w in (way, *more)]
         # of all regions together, to which it does not matter that the spectrum softens
         difference = float(jnp.sum(rates[2][0] - rates[1][0])) / 0.02
         assert float(jnp.sum(rates[0][1])) == pytest.approx(difference, rel=0.01)
