@@ -166,7 +166,8 @@ def free_share(ground: Ground, point: np.ndarray, reach: float) -> float:
 
 
 def test_nuclides_are_those_with_a_strong_line(yard):
-    drawn = {name for k in range(3) for name in yard.draw(range(200)).values[f"sources.{k}.nuclide"]}
+    values = yard.draw(range(200)).values
+    drawn = {name for k in range(3) for name in values[f"sources.{k}.nuclide"]}
     strong = {n.name for n in yard.scenario.nuclides.values() if max(line.yield_percent for line in n.lines) >= 10.0}
     assert drawn - {"Co-60"} <= strong
     assert drawn >= strong - {min(strong)}
