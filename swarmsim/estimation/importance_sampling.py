@@ -27,12 +27,13 @@ from swarmsim.pytree import pytree
 _EVEN = (0.8191725, 0.6710436, 0.5497005)
 FIRST_SPREAD = 2.0  # standard deviations of the first round over those that the curvature promises
 SCALES = (2.5, 1.2, 1.2, 0.6)  # spread of a round's places, in turn, over that of the places weighed so far
-ABOUT_MEAN = 3  # so many of the scales are about the mean: no tail goes unseen. The others are about likely places.
+ABOUT_MEAN = 3  # so many of the scales are about the mean, to see the tails. The others are about likely places.
 PLACED_EFFECTIVE = 8.0  # weights are flattened until they count as this many when the next round is placed
 LEAST_EFFECTIVE = 16.0  # and as this many for the moments
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
 LEAST_ROUNDS = 5
 LEAST_STD_M = 1e-3
+LEAST_SHARE = 1e-3  # standard deviation of a round in any direction, over that in all: two places far apart span one
 
 
 @pytree
@@ -51,7 +52,7 @@ class Posterior:
 
     mean: jax.Array  # [4]
     covariance: jax.Array  # [4, 4]
-    effective: jax.Array  # [] number of independent places that the weighted ones are worth
+    effective: jax.Array  # [] number of independent places that the weighted ones are worth (`_truncated`)
     halves: jax.Array  # [] distance between the means of two halves of the places, in standard deviations
 
 
@@ -114,7 +115,7 @@ def sample_posterior(
     def round_(done: _Rounds) -> _Rounds:
         k = done.count
         centres, about = placed(done)
-        root = jnp.linalg.cholesky(about + LEAST_STD_M**2 * jnp.eye(3))
+        root = jnp.linalg.cholesky(about + (LEAST_STD_M**2 + LEAST_SHARE**2 * jnp.trace(about)) * jnp.eye(3))
         drawn = each(weigh, centres + scales[:, None] * (normal[k] @ root.T), TOGETHER)
         return _with_round(done, drawn, centres, root)
 
@@ -136,7 +137,7 @@ def _summary(done: _Rounds) -> Posterior:
         mean=mean,
         covariance=covariance,
         effective=_worth(done),
-        halves=_halves(values, log_weights, covariance),
+        halves=_halves(values, log_weights, covariance, _drawn(done)),
     )
 
 
@@ -153,11 +154,15 @@ def drawn_evenly(places: jax.Array, weight: jax.Array, count: int) -> jax.Array:
     return places[jnp.minimum(index, places.shape[0] - 1)][turned]
 
 
-def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array) -> jax.Array:
-    """How far the means of two halves of the places of each round lie apart, in standard deviations of x and y."""
+def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, drawn: jax.Array) -> jax.Array:
+    """How far the means of two halves of the places of each round lie apart, in standard deviations of x and y.
+
+    There are ``drawn`` [] places in both.
+    """
     odd = jnp.arange(values.shape[1]) // len(SCALES) % 2 == 1  # both halves have all scales
     means = [
-        _moments(values, _truncated(jnp.where(half, log_weights, -jnp.inf)))[0] for half in (odd, jnp.logical_not(odd))
+        _moments(values, _truncated(jnp.where(half, log_weights, -jnp.inf), 0.5 * drawn))[0]
+        for half in (odd, jnp.logical_not(odd))
     ]
     apart = jnp.abs(means[0] - means[1])[:2] / jnp.sqrt(jnp.maximum(jnp.diagonal(covariance)[:2], LEAST_STD_M**2))
     return jnp.max(apart)
@@ -193,8 +198,8 @@ def _log_density(places: jax.Array, origin: jax.Array, centres: jax.Array, root:
 
 def _log_weights(done: _Rounds) -> jax.Array:
     """Logarithms [Q, P] of posterior over mixture of the distributions of all rounds so far."""
-    value = done.known.log_posterior
-    return jnp.where(jnp.isfinite(value), value - done.mixture, -jnp.inf)
+    weight = done.known.log_posterior - done.mixture
+    return jnp.where(jnp.isfinite(weight), weight, -jnp.inf)
 
 
 def _any_weight(done: _Rounds) -> jax.Array:
@@ -204,7 +209,12 @@ def _any_weight(done: _Rounds) -> jax.Array:
 
 def _worth(done: _Rounds) -> jax.Array:
     """How many independent places [] the weighted ones are worth."""
-    return jnp.where(_any_weight(done), _effective(_truncated(_log_weights(done))), 0.0)
+    return jnp.where(_any_weight(done), _effective(_truncated(_log_weights(done), _drawn(done))), 0.0)
+
+
+def _drawn(done: _Rounds) -> jax.Array:
+    """Number [] of places drawn so far."""
+    return (done.count * done.mixture.shape[1]).astype(jnp.float32)
 
 
 def _weights(log_weights: jax.Array, power: jax.Array | float = 1.0) -> jax.Array:
@@ -233,13 +243,14 @@ def flattened(log_weights: jax.Array, effective: float) -> jax.Array:
     return _weights(log_weights, jnp.where(enough, 1.0, jnp.exp(low)))
 
 
-def _truncated(log_weights: jax.Array) -> jax.Array:
+def _truncated(log_weights: jax.Array, drawn: jax.Array) -> jax.Array:
     """Weights [...] of sum 1, cut off at their mean times the root of their number (Ionides, JCGS 17, 2008, 295).
 
-    A place that the distributions drawn from hardly ever reach would otherwise outweigh all others.
+    A place that the distributions drawn from hardly ever reach would otherwise outweigh all others. That number is of
+    those ``drawn`` [], not of all that there is room for.
     """
     weights = _weights(log_weights)
-    weights = jnp.minimum(weights, 1.0 / jnp.sqrt(weights.size))
+    weights = jnp.minimum(weights, jax.lax.rsqrt(jnp.maximum(drawn, 1.0)))
     return weights / jnp.sum(weights)
 
 

@@ -28,7 +28,7 @@ REACHES = (1.5, 1.0)  # of the rounds after those, over `SearchParams.reach_m`; 
 CLOSING = 0.55  # reach of a later round over that of the one before
 NAMED_AGAIN = 3  # of those rounds, after which nuclides are compared again: from 6 m it is known to a metre then
 PROMISING = 0.3  # of the threshold: the open-air statistic that makes a search with rays worth while
-HOPELESS = 0.4  # of what a source must reach: the ratio at the best of some starts, below which it is given up
+HOPELESS = 0.4  # of what a source must reach: given up once the best place after the first starts has less than that
 TOLERANT = 0.25  # 1/m: error of the model in a round over its reach, so that wrong places differ by little at first
 MOST_TOLERANT = 0.5
 
@@ -82,7 +82,7 @@ def sought(
 
 
 def least_of(params: SearchParams, state: State) -> jax.Array:
-    """Twice the logarithm of the likelihood ratio [] that a further source must reach beside those of ``state``."""
+    """Twice the logarithm of the likelihood ratio [] that a source must reach beside those of ``state``, if any."""
     return jnp.where(jnp.any(state.sources.present), params.further, params.threshold)
 
 
@@ -111,7 +111,7 @@ def _best(
     up_m = 1.5 * problem.height_std_m
 
     def turn_of(number: jax.Array) -> jax.Array:
-        """By how much a round's pattern is turned: rounds of buildings and names draw none."""
+        """By how much a round's pattern is turned: rounds of buildings and of the second names draw none."""
         return (number - INDOORS - (number > closer + again)).astype(jnp.float32)
 
     def begin(best: Tried, number: jax.Array) -> Candidates:
@@ -167,6 +167,8 @@ def _best(
         tolerance = jnp.clip(
             TOLERANT * reaches[number], problem.model_std, jnp.maximum(problem.model_std, MOST_TOLERANT)
         )
+        # what is found in the end is compared with the fit without it
+        tolerance = jnp.where(number + 1 < reaches.shape[0], tolerance, problem.model_std)
         tolerant = replace(problem, model_std=tolerance)
         screen = screen_of(tolerant, others, best.fit.rates, best.nuclide, position_of(problem.site, best.place), u)
         anew = number >= BEGINNINGS

@@ -263,7 +263,7 @@ def roi_rates_and_slopes(
         by: numbers of U materials (static).
         weight: [n] of the places in the sums; 1 by default.
         places: in a sum, neighbours (static).
-        asked: [] bool; where it is False all rates are zero, for next to nothing.
+        asked: [] bool; where it is False rates mean nothing, and cost next to nothing if none of a batch are asked for.
     """
     given = jnp.ones(axis.shape[0]) if weight is None else weight
     lines = _lines_of(detector, source.nuclide)

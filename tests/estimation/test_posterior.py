@@ -19,6 +19,7 @@ from swarmsim.estimation.importance_sampling import (
     _log_weights,
     _Rounds,
     _with_round,
+    _worth,
     sample_posterior,
 )
 from swarmsim.estimation.localise import problem_of
@@ -92,6 +93,62 @@ def test_two_halves_that_disagree_are_told():
 
     found = jax.jit(lambda: sample_posterior(weigh, jnp.zeros(3), jnp.eye(3), 1, 64))()
     assert float(found.effective) < 16.0
+
+
+def two_modes(turn):
+    """A posterior [] of places with one mode at the origin, and less of another one six metres from it."""
+    other = 6.0 * jnp.stack([jnp.cos(turn), jnp.sin(turn), 0.0 * turn])
+
+    def weigh(x):
+        modes = jnp.stack([-0.5 * jnp.sum(x * x) + jnp.log(0.7), -0.5 * jnp.sum(jnp.square(x - other)) + jnp.log(0.3)])
+        zero = jnp.zeros(())
+        return Weighed(place=x, log_activity=zero, variance=zero, log_posterior=jax.scipy.special.logsumexp(modes))
+
+    return weigh
+
+
+def test_what_places_are_worth_does_not_depend_on_how_many_there_might_be():
+    """Sampling ends when there are enough, in five rounds or so."""
+    found = [
+        jax.jit(lambda rounds=rounds: sample_posterior(two_modes(0.3), jnp.zeros(3), jnp.eye(3), rounds, 24))()
+        for rounds in (12, 60)
+    ]
+    for one, other in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-4)
+
+
+def test_a_few_places_that_outweigh_all_others_are_not_worth_many():
+    """Two of 120 that have been drawn, of 960 that there is room for."""
+    weight = np.full(120, 0.1 / 118)
+    weight[:2] = 0.45
+    value = np.full((40, 24), -np.inf)
+    value[:5] = np.log(weight).reshape(5, 24)
+    zero = jnp.zeros((40, 24))
+    known = Weighed(place=jnp.zeros((40, 24, 3)), log_activity=zero, variance=zero, log_posterior=jnp.float32(value))
+    roots = jnp.broadcast_to(jnp.eye(3), (40, 3, 3))
+    done = _Rounds(known=known, centres=known.place, roots=roots, mixture=zero, count=jnp.int32(5))
+    assert float(_worth(done)) < 5.0
+
+
+@jax.jit
+@jax.vmap
+def _of_two_places(turn):
+    """A posterior that only the two of the first places farthest to either side of a line reach."""
+    across = jnp.stack([jnp.cos(turn), jnp.sin(turn), 0.0 * turn])
+
+    def weigh(x):
+        far = jnp.abs(x @ across) > 25.0
+        zero = jnp.zeros(())
+        return Weighed(place=x, log_activity=zero, variance=zero, log_posterior=jnp.where(far, 0.0, -jnp.inf))
+
+    return sample_posterior(weigh, jnp.zeros(3), jnp.diag(jnp.array([100.0, 100.0, 0.01])), 4, 8)
+
+
+def test_places_far_apart_that_span_no_volume_do_not_end_sampling():
+    found = _of_two_places(jnp.linspace(0.0, np.pi, 64))
+    assert bool(jnp.all(jnp.isfinite(found.mean)))
+    assert bool(jnp.all(jnp.isfinite(found.covariance)))
+    assert float(jnp.min(found.effective)) > 2.0
 
 
 def told(boxes, seed):
