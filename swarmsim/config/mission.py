@@ -9,7 +9,7 @@ from swarmsim.config.base import Delay, Duration, Fraction, Gap, Length, Model, 
 from swarmsim.config.flight import Failsafes, FlightEffects
 from swarmsim.config.radiation import Detector, Material, Nuclide
 from swarmsim.config.sensors import Sensor
-from swarmsim.config.sources import Source
+from swarmsim.config.sources import ACTIVITY_MAX_MBQ, Source
 from swarmsim.config.vary import SOURCES_MAX, VARIED_MAX, Distribution, VariedPath
 from swarmsim.config.vehicles import Vehicle
 
@@ -179,7 +179,7 @@ class Knowledge(Model):
     model_std: float = Field(default=0.05, ge=0.001, le=1)
     spectrum_std: float = Field(default=0.02, ge=0, le=1)
     learning_rate: float = Field(default=0.8, ge=0.01, le=1)
-    activity_mbq: float = Field(default=100.0, ge=1e-6, le=1e9)
+    activity_mbq: float = Field(default=100.0, ge=1e-6, le=ACTIVITY_MAX_MBQ)
     activity_factor: float = Field(default=10.0, ge=1.1, le=1e9)
     nuclides: Literal["unknown"] | Annotated[tuple[Name, ...], Field(min_length=1, max_length=100)] = "unknown"
 

@@ -16,6 +16,7 @@ FORMS: dict[str, Form] = {"position_m": "point", "line_m": "line", "area_m": "ar
 """Form of a source by the field that says where it is."""
 
 SPACING_M = 1.0
+ACTIVITY_MAX_MBQ = 1e9
 POINTS_MAX = 1000  # that all sources of a mission are computed as: each costs a ray to every detector
 _EDGE = 1e-6  # of a part or a cell: a smaller piece is left out
 _SIGNS = np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
@@ -51,7 +52,7 @@ class Source(Model):
     offset_m: Vec3 | None = None
     height_m: float | None = Field(default=None, ge=-5, le=100)
     spacing_m: Length | None = None
-    activity_mbq: float = Field(ge=0, le=1e9)
+    activity_mbq: float = Field(ge=0, le=ACTIVITY_MAX_MBQ)
 
     @model_validator(mode="after")
     def _one_place(self) -> "Source":

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
+from swarmsim.config.sources import ACTIVITY_MAX_MBQ
 from swarmsim.estimation.forward import Problem, Span, nodes_of, padded, trust_of
 from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.likelihood import natural_background, position_covariance
@@ -289,6 +290,15 @@ def sampled(
     return converged, mean, covariance + unsure[:, None, None] * jnp.diag(jnp.array([1.0, 1.0, 0.0, 0.0]))
 
 
+def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
+    """Activities [K] in Bq from which on another source is noticed, by the information [K] about its activity.
+
+    ``further`` [] is what it must reach. Infinite where it would have to be stronger than any.
+    """
+    activity = (jnp.sqrt(further) + NOTICED) / jnp.sqrt(jnp.maximum(information, 1e-37))
+    return jnp.where(activity < 1e6 * ACTIVITY_MAX_MBQ, activity, jnp.inf)
+
+
 def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Estimated:
     site, s, m = presumed.site, state.sources, problem.measurements
     posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
@@ -321,7 +331,7 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         effective_samples=jnp.nan_to_num(posterior.effective),
         converged=converged,
         joined_m=s.joined_m,
-        beside_bq=jnp.where(told > 0.0, (jnp.sqrt(params.search.further) + NOTICED) / jnp.sqrt(told), jnp.inf),
+        beside_bq=noticed_from(told, params.search.further),
     )
     strained, usual = strain(problem, state)
     order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))

@@ -9,7 +9,7 @@ import pytest
 
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.importance_sampling import Posterior
-from swarmsim.estimation.localise import sampled
+from swarmsim.estimation.localise import noticed_from, sampled
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
@@ -293,3 +293,9 @@ def test_estimates_reach_the_cramer_rao_bound_and_know_their_errors(localiser):
     logs = np.log([float(f.activity_bq[0]) / ACTIVITY for f in fits])
     assert np.std(logs) < 1.3 * least[3]
     assert np.mean([bool(f.converged[0]) for f in fits]) > 0.98
+
+
+def test_another_source_that_no_source_is_as_strong_as_is_never_noticed():
+    """A saturated detector tells next to nothing of more; what is told is 5 + 1.645 standard deviations (ISO 11929)."""
+    told = jnp.array([1e-14, 1e-30, 0.0])
+    np.testing.assert_allclose(noticed_from(told, jnp.float32(25.0)), [66.45e6, np.inf, np.inf], rtol=1e-4)
