@@ -111,7 +111,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
     class Scheduling(LoadFileScheduling):
         def _assign_work_unit(self, node: Any) -> None:
-            last = len(self.nodes) > 1 and node is self.nodes[-1]
+            last = len(self.nodes) > 1 and node.gateway.id == f"gw{len(self.nodes) - 1}"
             preferred = next((file for file in self.workqueue if file.startswith(_WAITING) == last), None)
             if preferred is not None:
                 self.workqueue.move_to_end(preferred, last=False)
