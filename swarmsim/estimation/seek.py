@@ -167,8 +167,6 @@ def _best(
         tolerance = jnp.clip(
             TOLERANT * reaches[number], problem.model_std, jnp.maximum(problem.model_std, MOST_TOLERANT)
         )
-        # what is found in the end is compared with the fit without it
-        tolerance = jnp.where(number + 1 < reaches.shape[0], tolerance, problem.model_std)
         tolerant = replace(problem, model_std=tolerance)
         screen = screen_of(tolerant, others, best.fit.rates, best.nuclide, position_of(problem.site, best.place), u)
         anew = number >= BEGINNINGS
