@@ -15,7 +15,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")  # so that the spreading of batches is tested
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see swarmsim/__init__.py
-# Two workers share two cores: threads of NumPy's that wait for work by spinning tripled the time of building a mission.
+# Workers share the cores: threads of NumPy's that wait for work by spinning tripled the time of building a mission.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Of the workers and of the programs that tests start: a compiler's millions of small objects are taken from and put
 # back on lists of each thread, and not merged with their neighbours at once.

@@ -141,9 +141,8 @@ def _around(
 ) -> tuple[jax.Array, jax.Array]:  # fmt: skip
     """Places [m, 3] about which the posterior of source ``k`` may have further modes; what is known of one beside it.
 
-    Half of the places are likely ones of many all around, by the screen; the rest is the other side of the way. Two of
-    either come after one another, for neighbours are drawn about at different scales. What is known is the second of
-    `posteriors`.
+    Half of the places are likely ones of many all around, by the screen; the rest is the other side of the way. What
+    is known is the second of `posteriors`.
     """
     place, nuclide = state.sources.place[k], state.sources.nuclide[k]
     best = as_known(problem, state, k, jnp.array(False)).fit
@@ -165,8 +164,16 @@ def _around(
 
     mirrored = mirrored_place(problem, place, jnp.sum(state.added.counts[k], axis=1))
     mirrored = jax.lax.fori_loop(0, MOVES, nearer, (mirrored, mirrored, -jnp.asarray(jnp.inf)))[1]
-    either = likely.reshape(-1, 2, 3), jnp.broadcast_to(mirrored, (MODES // 2, 2, 3))
-    return jnp.concatenate(either, axis=1).reshape(-1, 3), beside
+    return in_pairs(likely, mirrored), beside
+
+
+def in_pairs(likely: jax.Array, mirrored: jax.Array) -> jax.Array:
+    """Two of the ``likely`` places [m, 3], twice the ``mirrored`` one [3], and so on [2 m, 3]; m is even.
+
+    `sample_posterior` draws about neighbours at different scales: so it does about either kind.
+    """
+    either = likely.reshape(-1, 2, 3), jnp.broadcast_to(mirrored, (likely.shape[0] // 2, 2, 3))
+    return jnp.concatenate(either, axis=1).reshape(-1, 3)
 
 
 def _ring() -> jax.Array:

@@ -23,7 +23,7 @@ from swarmsim.estimation.importance_sampling import (
     sample_posterior,
 )
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.posterior import WEIGH_STEPS, posteriors
+from swarmsim.estimation.posterior import WEIGH_STEPS, in_pairs, posteriors
 from swarmsim.estimation.search import attempt, mirrored_place
 from swarmsim.estimation.state import Sources, no_sources
 from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
@@ -149,6 +149,19 @@ def test_places_far_apart_that_span_no_volume_do_not_end_sampling():
     assert bool(jnp.all(jnp.isfinite(found.mean)))
     assert bool(jnp.all(jnp.isfinite(found.covariance)))
     assert float(jnp.min(found.effective)) > 2.0
+
+
+def test_modes_of_either_kind_are_drawn_about_at_several_scales():
+    """Of the places of a first round the odd ones are drawn about modes, in turn, and the scales are so as well."""
+    likely, mirrored = jnp.stack([1e3 * jnp.arange(1.0, 7.0)] * 3, axis=1), jnp.zeros(3)
+    modes = in_pairs(likely, mirrored)
+    index = np.arange(1, 24, 2)  # of a round's places, those about modes
+    of_mirrored = np.all(np.asarray(modes)[index // 2 % len(modes)] == 0.0, axis=1)
+    scale = np.array(SCALES)[index % len(SCALES)]
+    assert of_mirrored.sum() == 6
+    assert len(set(scale[of_mirrored])) > 1
+    assert len(set(scale[~of_mirrored])) > 1
+    assert sorted(set(np.asarray(modes)[:, 0].tolist())) == [0.0, *(1e3 * np.arange(1.0, 7.0)).tolist()]
 
 
 def told(boxes, seed):

@@ -113,6 +113,7 @@ def test_a_third_wall_comes_in_steadily(detector: Detector) -> None:
     walls = [((0.0, 0.0, 1.0), (0.05, 1.0, 1.0), 0.0, "concrete"), ((8.0, 0.0, 1.0), (0.08, 3.0, 3.0), 0.0, "concrete")]
     site = yard(detector, *walls, ((16.0, 0.0, 1.0), (1.0, 20.0, 20.0), 0.0, "concrete"))
     half_extent = site.obstacles.half_extent_m
+    assert float(site.obstacles.centre_m[2, 0]) == 16.0
     ends = jnp.array([[-5.0, 0.0, 1.0]]), jnp.array([[40.0, 0.0, 1.5]])
 
     def of(thickness: jax.Array) -> jax.Array:
