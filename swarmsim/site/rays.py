@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -32,7 +33,7 @@ from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 
 NEIGHBOURS = 16  # segments that are intersected with the same clusters of boxes
 PAIRS = 128  # of a segment and a box, of which shares are computed at a time
-PAIRS_OF_MANY = 512  # the same of each of many places, on an accelerator
+PAIRS_OF_MANY = 128  # the same of each of many places, on an accelerator
 CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
 LOW_M = 2.0  # height at which half of the ground is left of what a low source in a building sees of it
 _TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
@@ -277,21 +278,24 @@ def by_threads(
     nothing, shapes = np.zeros(1, np.float32), above.shapes
     bare = jax.tree.map(lambda _: nothing, site)
 
-    def one(end: jax.Array, start: jax.Array, needed: Any, heights: tuple[jax.Array, jax.Array]) -> Way:
-        boxes, metre, terrain, origin, cell, ground = needed
+    def one(
+        end: jax.Array, followed: jax.Array, start: jax.Array, needed: Any, heights: tuple[jax.Array, jax.Array]
+    ) -> Way:
+        solid, metre, terrain, origin, cell, ground = needed
         here = replace(
-            bare, obstacles=boxes, wall_kg_m3=metre, terrain_m=terrain, origin_m=origin, cell_m=cell,
+            bare, obstacles=solid, wall_kg_m3=metre, terrain_m=terrain, origin_m=origin, cell_m=cell,
             ground_material=ground,
         )  # fmt: skip
         ceiling = Ceilings(highest_m=heights[0], around_m=heights[1], shapes=shapes)
-        return _way(here, ceiling, start, end, _box_after_box)
+        # without an end that a segment has of its own the loop has a derivative of every kind
+        boxes = _box_after_box if wanted is None else partial(_box_after_box, followed=followed)
+        return _way(here, ceiling, start, end, boxes)
 
     starts = jnp.broadcast_to(a, b.shape)
-    ways: Way = over_vehicles(one, (0, 0, None, None), platform=platform)(
-        b, starts, needed, (above.highest_m, above.around_m)
+    followed = jnp.ones(b.shape[0], bool) if wanted is None else wanted
+    ways: Way = over_vehicles(one, (0, 0, 0, None, None), platform=platform)(
+        b, followed, starts, needed, (above.highest_m, above.around_m)
     )
-    if wanted is not None:
-        ways = replace(ways, met=jax.tree.map(lambda key: jnp.where(wanted, key, 0), ways.met))
     return shaped(site.obstacles, of_metre, starts, b, ways, PAIRS_OF_MANY)
 
 
@@ -334,14 +338,19 @@ def _all_boxes(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Arr
     )
 
 
-def _box_after_box(site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array) -> _Found:
+def _box_after_box(
+    site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array, followed: jax.Array | None = None
+) -> _Found:
+    """What a segment meets; nothing if it is not ``followed`` [], which costs nothing if no neighbour is."""
     boxes, materials = site.obstacles, jnp.arange(len(site.material_names), dtype=jnp.int32)
 
     def add(k: jax.Array, found: _Found) -> _Found:
         box = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, k, 1), boxes)
         return _together(found, _of_box(site, box, jnp.asarray(k, jnp.int32), a, direction, distance))
 
-    return jax.lax.fori_loop(0, boxes.wall_m.shape[0], add, _nothing_found(materials.shape[0]))
+    number = boxes.wall_m.shape[0]
+    last = number if followed is None else jnp.where(followed, number, 0)
+    return jax.lax.fori_loop(0, last, add, _nothing_found(materials.shape[0]))
 
 
 def _of_boxes(
