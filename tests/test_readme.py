@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 import swarmsim
+from swarmsim.cli.files import kind_of_file
 from swarmsim.config.files import packaged_dir
 from swarmsim.config.load import load_named
 from swarmsim.config.scenario import load_scenario
@@ -59,6 +60,14 @@ def test_the_phases_shown_are_read(tmp_path):
     path = tmp_path / "shown.yaml"
     path.write_text(yaml.safe_dump(rest | yaml.safe_load(shown)), encoding="utf-8")
     assert [phase.name for phase in swarmsim.load(path).mission.phases] == ["survey", "look"]
+
+
+def test_the_family_shown_is_read(tmp_path):
+    shown = next(text for language, text in BLOCKS if language == "yaml" and "random_yard" in text)
+    path = tmp_path / "random_yard.yaml"
+    path.write_text(shown, encoding="utf-8")
+    assert swarmsim.load(path).family
+    assert kind_of_file(path) == "missions"
 
 
 @pytest.mark.parametrize("kind", CONFIGURATIONS)

@@ -2,6 +2,7 @@
 
 import atexit
 import contextlib
+import errno
 import gc
 import io
 import os
@@ -75,7 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Wrong input is told on standard error without a traceback; an error of swarmsim itself keeps its traceback.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(line_buffering=True)  # so that a file or a pipe shows how far a run is
+        # line by line, so that a file or a pipe shows how far a run is; names may hold what a terminal cannot show
+        sys.stdout.reconfigure(line_buffering=True, errors="backslashreplace")
     if arguments is None:
         _handle_signals()
     atexit.register(gc.freeze)  # the interpreter's last collection of garbage would take another second
@@ -100,6 +102,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INPUT
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        name = str(error.filename or "")
+        _told(f"no file can have so long a name: '{name[:60]}...' ({len(name)} characters)\n")
+        return EXIT_INPUT
     except (KeyboardInterrupt, RuntimeError) as error:
         stop = _stop_of(error)
         if stop is None:

@@ -212,6 +212,10 @@ def _check_materials(scenario: Scenario) -> Iterator[Problem]:
     for detector in scenario.detectors.values():
         for name in filter(None, (detector.crystal, detector.housing.material)):
             wanted.append(("vehicles", f"the detector '{detector.name}' is made of", name))
+    for name in scenario.mission.background.surfaces:
+        if name not in materials:
+            place, message = ("background", "surfaces", name), f"there is no material '{name}'"
+            yield scenario.problem(place, message, allowed=one_of(materials), suggestion=did_you_mean(name, materials))
     for where, who, name in wanted:
         if name not in materials:
             message, hint = f"{who} a material '{name}' that does not exist", did_you_mean(name, materials)

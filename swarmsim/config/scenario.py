@@ -260,6 +260,14 @@ def _found_from_anywhere(policy: str, near: Path | None) -> str:
     return policy if (Path.cwd() / file).resolve() == path else f"{path}:{name}"
 
 
+def _table(parent: dict[str, Any], key: str) -> dict[str, Any] | None:
+    """The table under a key, a new one where there is nothing; None where there is something else."""
+    if parent.get(key) is None:
+        parent[key] = {}
+    found = parent[key]
+    return found if isinstance(found, dict) else None
+
+
 def _bring_in_definitions(document: Document, overrides: Sequence[str], near: Path) -> list[Problem]:
     """Copy into ``definitions`` what overrides or `vary` change: ``definitions.vehicles.tarot_t650.mass_kg=4``."""
     problems: list[Problem] = []
@@ -279,7 +287,10 @@ def _bring_in_definitions(document: Document, overrides: Sequence[str], near: Pa
         except InputError as error:
             problems += error.problems
             continue
-        definitions = document.data.setdefault("definitions", {})
-        definitions.setdefault(steps[1], {})[steps[2]] = source.data
+        kinds = _table(document.data, "definitions")
+        named = None if kinds is None else _table(kinds, steps[1])
+        if named is None:
+            continue  # of what is no table the check tells
+        named[steps[2]] = source.data
         document.marks |= {(*place, *inner): mark for inner, mark in source.marks.items()}
     return problems

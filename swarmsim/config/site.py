@@ -75,7 +75,7 @@ class SiteSpec(Model):
     unit_m: Positive | None = None
     height_unit_m: Positive | None = None
     up_axis: Literal["X", "Y", "Z"] | None = None
-    cell_m: Positive
+    cell_m: Annotated[float, Field(ge=1e-3, le=1e6)]
     extent_m: tuple[Positive, Positive] = (10.0, 1000.0)
     holes_max: Fraction = 0.15
     max_file_mb: Positive = 100.0

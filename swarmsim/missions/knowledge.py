@@ -162,7 +162,7 @@ def accumulate_spectrum(
     """The spectrum taken during the samples that are ``used`` [n], by detector model ``model``.
 
     The sum of the samples' Poisson spectra is drawn at once, as a Poisson spectrum of the summed mean. The analyser has
-    its own draw: its total differs from the counter's by statistics, as it would with a dead time of its own.
+    its own draw, without dead time: its total differs from the counter's by statistics and by what that one missed.
     """
     detector = detector_of(world, model)
     # an idealised counter draws counts that stand for one second, whatever its period is

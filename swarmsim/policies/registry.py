@@ -119,7 +119,17 @@ def vehicle_kinds(reference: str, near: Path | None = None) -> tuple[str, ...]:
     if _is_shipped(reference):
         return model.vehicles
     kinds = getattr(find(reference, near), "vehicles", None)
-    return model.vehicles if kinds is None else (kinds,) if isinstance(kinds, str) else tuple(kinds)
+    return model.vehicles if kinds is None else _names(kinds, reference, "vehicles")
+
+
+def _names(given: Any, reference: str, attribute: str) -> tuple[str, ...]:
+    """The names that a policy's attribute holds, one or several; raises `InputError` for anything else."""
+    names = (given,) if isinstance(given, str) else given
+    if isinstance(names, (tuple, list)) and all(isinstance(name, str) for name in names):
+        return tuple(names)
+    raise InputError.of(
+        f"'{attribute}' of the policy '{reference}' must be a name or a tuple of names", given=repr(given)[:60]
+    )
 
 
 def senses(reference: str, near: Path | None = None) -> tuple[str, ...]:
@@ -130,7 +140,7 @@ def senses(reference: str, near: Path | None = None) -> tuple[str, ...]:
     if _is_shipped(reference):
         return ()
     given = getattr(find(reference, near), "senses", ())
-    kinds = (given,) if isinstance(given, str) else tuple(given)
+    kinds = _names(given, reference, "senses")
     for kind in kinds:
         if kind not in SENSOR_KINDS:
             raise InputError.of(

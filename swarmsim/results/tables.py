@@ -22,7 +22,8 @@ _MEASURED = (
 )
 _SPECTRUM = (
     "spectrum that the nuclide was identified by, summed over samples near the source (energy: centre of the channel) "
-    "with the expected background and the fit; drawn by itself: its total differs from the samples' by statistics"
+    "with the expected background and the fit; drawn by itself and without dead time: its total exceeds the samples' "
+    "counts by what the counter missed, and differs by statistics"
 )
 
 

@@ -1,5 +1,6 @@
 """COLLADA files as parts, read in double precision: pycollada rounds to float32, half a metre at UTM coordinates."""
 
+import itertools
 import warnings
 from collections.abc import Iterator
 from pathlib import Path, PurePath
@@ -9,6 +10,8 @@ import numpy as np
 
 from swarmsim.config.errors import InputError
 from swarmsim.site.mesh_parts import NO_COLOUR, Floats, Part, RawMesh, to_bytes
+
+INSTANCES_MAX = 100_000  # nodes, with every instance of each
 
 
 def read_collada(path: Path) -> RawMesh:
@@ -29,8 +32,9 @@ def _scene(scene: Any, path: Path) -> RawMesh:
         raise InputError.of("has no <scene>", file=path, suggestion="export it again with its scene")
     parts, lines = [], 0
     points: dict[int, Floats] = {}
+    left = itertools.count(INSTANCES_MAX, -1)
     for node in scene.scene.nodes:
-        for name, matrix, geometry in _geometries(node, np.eye(4), ""):
+        for name, matrix, geometry in _geometries(node, np.eye(4), "", left, path):
             for primitive in geometry.original.primitives:
                 if isinstance(primitive, LineSet):
                     lines += 1
@@ -47,8 +51,18 @@ def _scene(scene: Any, path: Path) -> RawMesh:
     return RawMesh(parts, unit, axis, lines)
 
 
-def _geometries(node: Any, matrix: Floats, name: str) -> Iterator[tuple[str, Floats, Any]]:
-    """The geometries below a node with their matrices [4, 4], each with the name of the nearest named node."""
+def _geometries(
+    node: Any, matrix: Floats, name: str, left: Iterator[int], path: Path
+) -> Iterator[tuple[str, Floats, Any]]:  # fmt: skip
+    """The geometries below a node with their matrices [4, 4], each with the name of the nearest named node.
+
+    ``left`` counts down how many more nodes there may be: instances of instances multiply.
+    """
+    if next(left) <= 0:
+        raise InputError.of(
+            "has too many nodes, with every instance of each", file=path, allowed=f"at most {INSTANCES_MAX:,}",
+            suggestion="join meshes and export it again",
+        )  # fmt: skip
     if not hasattr(node, "children"):
         for geometry in node.objects("geometry", np.eye(4)):
             yield name, matrix, geometry
@@ -57,7 +71,7 @@ def _geometries(node: Any, matrix: Floats, name: str) -> Iterator[tuple[str, Flo
     for transform in getattr(node, "node", node).transforms:  # an instance of a node has that node's transforms
         matrix = matrix @ _matrix(transform)
     for child in node.children:
-        yield from _geometries(child, matrix, own)
+        yield from _geometries(child, matrix, own, left, path)
 
 
 def _matrix(transform: Any) -> Floats:

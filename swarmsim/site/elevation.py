@@ -23,6 +23,8 @@ HEIGHT_MAX_M = 12_000.0  # larger values, up or down, are no heights on Earth
 GAP_M = 100.0  # a value this far from all others, and farther than they differ, that is there again and again: no data
 SCALE_TOLERANCE = 0.005  # true length of a projected metre: nearer to one it is left alone
 STRETCH_MAX = 0.02  # largest change of that length over a raster
+RASTER_MAX = 100_000_000  # cells, which are held in memory together
+LEAST_CELL = 1e-4  # units of the projection
 DEGREES_MAX = 0.01  # smaller cells without a projection are no metres
 REPROJECT = "reproject it to metres, e.g. gdalwarp -t_srs EPSG:32632 IN.tif OUT.tif"
 FEET_M = (0.3048, 1200.0 / 3937.0)  # international and US survey foot
@@ -204,6 +206,11 @@ def _check_raster(file: Any, path: Path) -> None:
             "is not georeferenced, so the size of its cells is unknown", file=path,
             suggestion="give it one, e.g. gdal_translate -a_ullr 0 HEIGHT_M WIDTH_M 0 IN.tif OUT.tif",
         )  # fmt: skip
+    if file.width * file.height > RASTER_MAX:
+        raise InputError.of(
+            f"has {file.width} x {file.height} cells", file=path, allowed=f"at most {RASTER_MAX:,} cells",
+            suggestion="cut out the site or resample it: gdalwarp -te WEST SOUTH EAST NORTH -tr SIZE SIZE IN.tif OUT.tif",
+        )  # fmt: skip
     if file.crs and file.crs.is_geographic:
         raise InputError.of(
             "is in degrees",
@@ -215,6 +222,8 @@ def _check_raster(file: Any, path: Path) -> None:
             f"has cells of {matrix.a:g} and names no projection: they are probably degrees", file=path,
             suggestion="say so and reproject it, e.g. gdalwarp -s_srs EPSG:4326 -t_srs EPSG:32632 IN.tif OUT.tif",
         )  # fmt: skip
+    if not matrix.a >= LEAST_CELL:
+        raise InputError.of(f"has cells of {matrix.a:g}", file=path, allowed=f"{LEAST_CELL:g} or more of its unit")
     if matrix.b or matrix.d or matrix.e >= 0 or abs(matrix.a + matrix.e) > 1e-3 * matrix.a:
         raise InputError.of(
             "must be north-up with square cells", file=path, given=f"transform {tuple(matrix)[:6]}",

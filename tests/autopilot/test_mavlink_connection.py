@@ -92,6 +92,8 @@ def test_links_that_cannot_be_opened():
         Connection(f"tcp:{port}", print)
     with pytest.raises(LinkError, match="plugged in"):
         Connection("serial:/dev/there-is-none:57600", print)
+    with pytest.raises(LinkError, match="cannot be opened"):
+        Connection(f"tcp:{'a' * 64}:5", print)
 
 
 def test_a_log_that_cannot_be_written(tmp_path):
@@ -198,6 +200,9 @@ def test_keys(tmp_path):
     assert read_key(tmp_path / "raw") == read_key(tmp_path / "hex") == KEY
     with pytest.raises(InputError, match="no signing key"):
         read_key(tmp_path / "bad")
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="no regular file"):
+        read_key(tmp_path / "pipe")
 
 
 def test_only_signed_messages_are_accepted():

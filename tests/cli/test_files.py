@@ -174,3 +174,18 @@ def test_import_site_of_a_missing_file(project: Path, capsys: pytest.CaptureFixt
     assert cli.main(["import-site", "no.dae", "--out", "configs/sites/new"]) == 2
     assert "no.dae" in capsys.readouterr().err
     assert everything(project) == before
+
+
+def test_a_name_that_no_file_can_have_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["import-site", "b" * 300, "--out", "o"]) == 2
+    assert "so long a name: 'bbbb" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_check_tells_the_kind_by_what_a_file_extends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.yaml").write_text("extends: recon\nname: mine\n")
+    assert cli.main(["check", "mine.yaml"]) == 0

@@ -325,3 +325,24 @@ def test_load_model_tells_the_same(mission: Path) -> None:
     spoil(mission, "seed: 0", "seed: zero")
     with pytest.raises(InputError, match=r"recon\.yaml:6 seed: is not a whole number"):
         load_model(mission, Mission)
+
+
+@pytest.mark.parametrize("given", ["", "{vehicles: }"])
+def test_empty_definitions_are_those_of_none(mission: Path, given: str) -> None:
+    path = mission.with_name("empty.yaml")
+    path.write_text(f"extends: recon\nname: empty\ndefinitions: {given}\n")
+    scenario = load_scenario(path, ["definitions.vehicles.tarot_t650.mass_kg=4"])
+    assert [vehicle.mass_kg for vehicle in scenario.vehicles[:3]] == [4.0] * 3
+
+
+@pytest.mark.parametrize("given", ["5", "[]", "{vehicles: [1]}"])
+def test_definitions_that_are_no_table_are_told(mission: Path, given: str) -> None:
+    path = mission.with_name("wrong.yaml")
+    path.write_text(f"extends: recon\nname: wrong\ndefinitions: {given}\n")
+    assert "definitions" in message_of(path, "definitions.vehicles.tarot_t650.mass_kg=4")
+
+
+def test_a_surface_of_no_material_is_told(mission: Path) -> None:
+    message = message_of(mission, "background.surfaces={concret: 1.5}")
+    assert "there is no material 'concret'" in message
+    assert "did you mean 'concrete'" in message

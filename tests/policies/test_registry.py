@@ -243,3 +243,11 @@ def test_a_written_scenario_finds_the_policy_from_anywhere(
     again = load_scenario(written)
     assert again.mission.phases[0].policy == f"{(project.parent / 'beside.py').resolve()}:climb"
     assert again.settings == scenario.settings
+
+
+@pytest.mark.parametrize("line", ["vehicles = 5", "senses = 5", "senses = (1, 2)"])
+def test_names_that_are_none_are_refused(project: Path, line: str) -> None:
+    Path("wrong.py").write_text(CLIMB.replace('vehicles = ("multirotor",)', line))
+    asked = registry.senses if line.startswith("senses") else registry.vehicle_kinds
+    with pytest.raises(InputError, match="must be a name or a tuple of names"):
+        asked("wrong.py:climb")

@@ -1,5 +1,8 @@
 """What a user hears when a file or a specification cannot be a site."""
 
+import itertools
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -7,7 +10,7 @@ from rasterio.transform import Affine
 from yards import MATERIALS, TO_Y_UP, ground_plate, spec, write_tiff, yard
 
 from swarmsim.config.errors import InputError
-from swarmsim.site import ImportOptions, import_site, load_site
+from swarmsim.site import ImportOptions, collada_reader, import_site, load_site
 from swarmsim.site.importer import build
 
 
@@ -168,3 +171,28 @@ def test_a_folder_that_is_no_site_is_never_replaced(tmp_path):
     with pytest.raises(InputError, match="not a site"):
         import_site(tmp_path / "yard.stl", precious, ImportOptions(overwrite=True), MATERIALS)
     assert (precious / "thesis.txt").read_text() == "years of work"
+
+
+def test_rasters_of_too_many_cells_or_of_none_are_not_read(tmp_path, monkeypatch):
+    rows = np.zeros((20, 30), np.float32)
+    write_tiff(tmp_path / "tiny.tif", rows, crs="EPSG:32633", transform=Affine(1e-300, 0.0, 0.0, 0.0, -1e-300, 0.0))
+    refused(tmp_path / "tiny.tif", ["has cells of 1e-300"])
+    monkeypatch.setattr("swarmsim.site.elevation.RASTER_MAX", 599)
+    write_tiff(tmp_path / "large.tif", rows)
+    refused(tmp_path / "large.tif", ["30 x 20 cells", "at most 599", "gdalwarp"])
+
+
+def test_instances_of_instances_are_counted():
+    class Node:
+        xmlnode, transforms = None, ()
+
+        def __init__(self, *children):
+            self.children = children
+
+    node = Node()
+    for _ in range(9):
+        node = Node(*[node] * 10)
+    with pytest.raises(InputError, match="too many nodes"):
+        list(collada_reader._geometries(node, np.eye(4), "", itertools.count(1000, -1), Path("x.dae")))
+    few = Node(Node(), Node())
+    assert list(collada_reader._geometries(few, np.eye(4), "", itertools.count(1000, -1), Path("x.dae"))) == []

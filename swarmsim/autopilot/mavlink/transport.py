@@ -82,7 +82,7 @@ def open_transport(address: LinkAddress, refused_s: float = 0.0) -> Transport:
             if time.monotonic() > end:
                 raise _cannot_open(address, error) from error
             time.sleep(_REFUSED_S)
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # the latter for a name that no host can have
             raise _cannot_open(address, error) from error
 
 
@@ -96,7 +96,7 @@ def _opened(address: LinkAddress) -> Transport:
     return _Serial(address)
 
 
-def _cannot_open(address: LinkAddress, error: OSError) -> LinkError:
+def _cannot_open(address: LinkAddress, error: OSError | UnicodeError) -> LinkError:
     advice = {
         "udpin": "another program may listen there already: give this vehicle a port of its own",
         "tcpin": "another program may listen there already: give this vehicle a port of its own",
@@ -104,7 +104,7 @@ def _cannot_open(address: LinkAddress, error: OSError) -> LinkError:
         "tcp": "start the autopilot, and check that no other client is connected to this port",
         "serial": "check that the device is plugged in and that you may read it (group dialout)",
     }[address.kind]
-    return LinkError(f"{address} cannot be opened ({error.strerror or error}): {advice}")
+    return LinkError(f"{address} cannot be opened ({getattr(error, 'strerror', None) or error}): {advice}")
 
 
 def _family(host: str) -> socket.AddressFamily:

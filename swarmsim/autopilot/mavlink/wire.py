@@ -20,6 +20,8 @@ _MARKERS = (mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2)
 def read_key(path: Path) -> bytes:
     """The signing key [32 bytes] of a file with 64 hexadecimal digits or 32 bytes; raises `InputError`."""
     with file_errors_told("the signing key cannot be read", file=path):
+        if Path(path).exists() and not Path(path).is_file():
+            raise InputError.of("the signing key is no regular file", file=path)  # a pipe would be waited for
         data = Path(path).read_bytes()
     if len(data) == _KEY_BYTES:
         return data
