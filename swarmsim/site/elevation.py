@@ -209,7 +209,7 @@ def _check_raster(file: Any, path: Path) -> None:
     if file.width * file.height > RASTER_MAX:
         raise InputError.of(
             f"has {file.width} x {file.height} cells", file=path, allowed=f"at most {RASTER_MAX:,} cells",
-            suggestion="cut out the site or resample it: gdalwarp -te WEST SOUTH EAST NORTH -tr SIZE SIZE IN.tif OUT.tif",
+            suggestion="cut out or resample the site: gdalwarp -te WEST SOUTH EAST NORTH -tr SIZE SIZE IN.tif OUT.tif",
         )  # fmt: skip
     if file.crs and file.crs.is_geographic:
         raise InputError.of(
