@@ -297,6 +297,7 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     """
     record = record.finite()
     row: dict[str, Any] = {"seed": int(record.seed), "status": record.status, "finding": record.finding}
+    row["covered"] = record.covered
     row |= columns(record.drawn)
     for phase in record.phases:
         row |= {f"{phase.name}_{key}": value for key, value in _measured(record, phase).items()}

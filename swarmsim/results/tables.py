@@ -25,6 +25,12 @@ _SPECTRUM = (
     "with the expected background and the fit; drawn by itself and without dead time: its total exceeds the samples' "
     "counts by what the counter missed, and differs by statistics"
 )
+_MISSIONS = (
+    "missions of a batch, a row each: seed, status and finding; drawn_ what was drawn for it; PHASE_ what that phase "
+    "measured; survey_estimate_ and source_ the surest source after the survey and in the end, by all counts (std_ the "
+    "standard deviations, error_m the distance to the nearest true source); sources_found how many; nuclide and "
+    "nuclide_confidence of the spectrum taken near it; success whether the answer is right and nothing went wrong"
+)
 
 
 def _metadata(record: MissionRecord, what: str) -> dict[str, str]:
@@ -126,4 +132,4 @@ def missions_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
         columns[key] = (
             pa.array(values, pa.string() if key.endswith("nuclide") else pa.float64()) if empty else pa.array(values)
         )
-    return pa.table(columns)
+    return pa.table(columns, metadata={"content": _MISSIONS, "frame": _FRAME})

@@ -168,6 +168,8 @@ def test_columns_of_a_phase_that_only_some_missions_came_to(record: MissionRecor
         rows = [batch_row(one) for one in batch]
         table = run_directory.missions_table(rows)
         assert table.column_names == list(batch_row(record))
+        assert table["covered"].to_pylist() == [record.covered] * 2
+        assert "standard deviations" in table.schema.metadata[b"content"].decode()
         assert table["search_duration_s"].to_pylist() == [row.get("search_duration_s") for row in rows]
 
 
