@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
 from swarmsim.results.record import Estimate, Spectrum
 from swarmsim.results.status import CONFIRMED, Verdict, in_mbq
@@ -51,7 +53,11 @@ def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, hindrance: st
 
 def _placed(estimate: Estimate) -> str:
     x, y = estimate.position_m[:2]
-    placed = f"{in_mbq(estimate.activity_mbq)} {estimate.nuclide} at ({x:.1f}, {y:.1f}) m"
+    # one standard deviation, in the direction in which it is largest
+    (xx, xy), (_, yy) = np.asarray(estimate.covariance_m2, float)[:2, :2]
+    std = math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))
+    digits = 1 if std >= 0.095 else 2
+    placed = f"{in_mbq(estimate.activity_mbq)} {estimate.nuclide} at ({x:.{digits}f}, {y:.{digits}f}) ± {std:.2g} m"
     if estimate.joined_m > 0.0:
         return f"{placed} (or several within {math.ceil(estimate.joined_m)} m, or behind other walls than presumed)"
     another = f"another {estimate.nuclide} source {ONE_M:g} to {COMPANION_M:g} m off"

@@ -98,3 +98,13 @@ def test_the_activity_of_a_faint_source_is_not_zero():
     for activity, said in ((0.0107, "0.011 MBq"), (9.96, "10 MBq"), (170.4, "170 MBq")):
         faint = (estimate(activity=activity),)
         assert f"a source of {said} Co-60" in finding(SURE, faint, None, hindrance=None, presumed=False)
+
+
+@pytest.mark.parametrize(
+    ("std", "said"), [(0.0583, "(3.13, -0.50) ± 0.058 m"), (2.34, "(3.1, -0.5) ± 2.3 m"), (41.0, "(3.1, -0.5) ± 41 m")]
+)
+def test_how_well_the_place_is_known_is_said_by_its_largest_deviation(std, said):
+    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    covariance = turn @ np.diag([std**2, (0.3 * std) ** 2, 900.0]) @ turn.T
+    one = replace(estimate(), position_m=np.array([3.126, -0.497, 0.0]), covariance_m2=covariance)
+    assert f" at {said} (" in finding(SURE, (one,), None, hindrance=None, presumed=False)
