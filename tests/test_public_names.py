@@ -50,3 +50,7 @@ def test_a_cpu_runs_a_loop_as_one_function_unless_told_otherwise(flags: str, one
     found, *kept = result.stdout.split()
     assert found == str(one_function)
     assert set(flags.split()) <= set(kept)
+
+
+def test_the_public_names_are_offered_for_completion():
+    assert set(swarmsim.__all__) <= set(dir(swarmsim))

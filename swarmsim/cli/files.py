@@ -158,7 +158,7 @@ def kind_of_file(path: Path) -> str:
     fields = read_file(path).data
     if "kind" in fields:
         return "sensors" if fields["kind"] in SENSOR_KINDS else "vehicles"
-    extended = [kind for kind in files.KINDS if str(fields.get("extends")) in files.available(kind, path)]
+    extended = [kind for kind in files.KINDS if str(fields.get("extends", "")) in files.available(kind, path)]
     if len(extended) == 1:
         return extended[0]
     own = {kind: set(shape_of(MODELS[kind]).fields((), None)) for kind in files.KINDS if kind not in _TOLD_BY_KIND}

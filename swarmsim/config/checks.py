@@ -208,18 +208,17 @@ def _nearest_multiples(period: float, unit: float) -> str | None:
 
 def _check_materials(scenario: Scenario) -> Iterator[Problem]:
     site, materials = scenario.site, scenario.materials
-    wanted = [("site", f"the site '{site.name}' is made of", name) for name in _site_materials(site)]
+    made = f"the site '{site.name}' is made of"
+    wanted: list[tuple[Place, str, str]] = [(("site",), made, name) for name in _site_materials(site)]
     for detector in scenario.detectors.values():
         for name in filter(None, (detector.crystal, detector.housing.material)):
-            wanted.append(("vehicles", f"the detector '{detector.name}' is made of", name))
+            wanted.append((("vehicles",), f"the detector '{detector.name}' is made of", name))
     for name in scenario.mission.background.surfaces:
-        if name not in materials:
-            place, message = ("background", "surfaces", name), f"there is no material '{name}'"
-            yield scenario.problem(place, message, allowed=one_of(materials), suggestion=did_you_mean(name, materials))
+        wanted.append((("background", "surfaces", name), "a surface is of", name))
     for where, who, name in wanted:
         if name not in materials:
             message, hint = f"{who} a material '{name}' that does not exist", did_you_mean(name, materials)
-            yield scenario.problem((where,), message, allowed=one_of(materials), suggestion=hint)
+            yield scenario.problem(where, message, allowed=one_of(materials), suggestion=hint)
 
 
 def _site_materials(site: SiteSpec) -> list[str]:

@@ -125,7 +125,7 @@ def vehicle_kinds(reference: str, near: Path | None = None) -> tuple[str, ...]:
 def _names(given: Any, reference: str, attribute: str) -> tuple[str, ...]:
     """The names that a policy's attribute holds, one or several; raises `InputError` for anything else."""
     names = (given,) if isinstance(given, str) else given
-    if isinstance(names, (tuple, list)) and all(isinstance(name, str) for name in names):
+    if isinstance(names, (tuple, list, set, frozenset)) and all(isinstance(name, str) for name in names):
         return tuple(names)
     raise InputError.of(
         f"'{attribute}' of the policy '{reference}' must be a name or a tuple of names", given=repr(given)[:60]

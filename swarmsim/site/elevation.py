@@ -222,13 +222,13 @@ def _check_raster(file: Any, path: Path) -> None:
             f"has cells of {matrix.a:g} and names no projection: they are probably degrees", file=path,
             suggestion="say so and reproject it, e.g. gdalwarp -s_srs EPSG:4326 -t_srs EPSG:32632 IN.tif OUT.tif",
         )  # fmt: skip
-    if not matrix.a >= LEAST_CELL:
-        raise InputError.of(f"has cells of {matrix.a:g}", file=path, allowed=f"{LEAST_CELL:g} or more of its unit")
     if matrix.b or matrix.d or matrix.e >= 0 or abs(matrix.a + matrix.e) > 1e-3 * matrix.a:
         raise InputError.of(
             "must be north-up with square cells", file=path, given=f"transform {tuple(matrix)[:6]}",
             suggestion="resample it with gdalwarp -tr SIZE SIZE",
         )  # fmt: skip
+    if matrix.a < LEAST_CELL:
+        raise InputError.of(f"has cells of {matrix.a:g}", file=path, allowed=f"{LEAST_CELL:g} or more of its unit")
     if file.count >= 3 and file.dtypes[0] == "uint8":
         raise InputError.of(
             "is a picture, not an elevation model", file=path,

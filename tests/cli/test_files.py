@@ -1,6 +1,8 @@
 """Commands that work on files: check, schema, list, init and import-site."""
 
+import io
 import json
+import sys
 import types
 from pathlib import Path
 from typing import Any
@@ -189,3 +191,25 @@ def test_check_tells_the_kind_by_what_a_file_extends(tmp_path: Path, monkeypatch
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.yaml").write_text("extends: recon\nname: mine\n")
     assert cli.main(["check", "mine.yaml"]) == 0
+
+
+def test_a_name_that_the_output_cannot_show_is_told_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "m\u00fc.yaml").write_text("extends: recon\nname: mine\n")
+    shown = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(shown, encoding="ascii"))
+    assert cli.main(["check", "m\u00fc.yaml"]) == 0
+    sys.stdout.flush()
+    assert b"m\\xfc.yaml" in shown.getvalue()
+
+
+def test_cells_of_next_to_nothing_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = packaged_dir() / "sites" / "works_yard" / "works_yard.dae"
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["import-site", str(mesh), "--out", "o", "--cell", "1e-308"]) == 2
+    assert "cell_m" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

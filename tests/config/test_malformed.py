@@ -344,5 +344,5 @@ def test_definitions_that_are_no_table_are_told(mission: Path, given: str) -> No
 
 def test_a_surface_of_no_material_is_told(mission: Path) -> None:
     message = message_of(mission, "background.surfaces={concret: 1.5}")
-    assert "there is no material 'concret'" in message
+    assert "background.surfaces.concret: a surface is of a material 'concret' that does not exist" in message
     assert "did you mean 'concrete'" in message

@@ -251,3 +251,8 @@ def test_names_that_are_none_are_refused(project: Path, line: str) -> None:
     asked = registry.senses if line.startswith("senses") else registry.vehicle_kinds
     with pytest.raises(InputError, match="must be a name or a tuple of names"):
         asked("wrong.py:climb")
+
+
+def test_names_may_be_given_as_a_set(project: Path) -> None:
+    Path("set.py").write_text(CLIMB.replace('vehicles = ("multirotor",)', 'vehicles = {"multirotor"}'))
+    assert registry.vehicle_kinds("set.py:climb") == ("multirotor",)

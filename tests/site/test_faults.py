@@ -138,6 +138,8 @@ def test_elevation_models_that_cannot_be_used(tmp_path):
     refused(tmp_path / "degrees.tif", ["degrees", "gdalwarp"])
     write_tiff(tmp_path / "turned.tif", rows, transform=Affine(5.0, 1.0, 0.0, 1.0, -5.0, 0.0))
     refused(tmp_path / "turned.tif", ["north-up"])
+    write_tiff(tmp_path / "mirrored.tif", rows, transform=Affine(-5.0, 0.0, 0.0, 0.0, -5.0, 0.0), crs="EPSG:32633")
+    refused(tmp_path / "mirrored.tif", ["north-up"])
     write_tiff(tmp_path / "picture.tif", np.zeros((3, 20, 30), np.uint8), count=3)
     refused(tmp_path / "picture.tif", ["picture", "orthophoto"])
     write_tiff(tmp_path / "nothing.tif", np.full((20, 30), np.nan, np.float32))
