@@ -13,7 +13,7 @@ from swarmsim.config.documents import Document, Place, dotted
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.mission import PHASES_MAX, Trigger
 from swarmsim.config.names import did_you_mean, one_of
-from swarmsim.config.policies import LandOn, PolicySettings
+from swarmsim.config.policies import LandOn, Orbit, ParallelLines, PolicySettings, Waypoints
 from swarmsim.config.validation import validate
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 ESTIMATES = {"source": ("mapping", "localisation"), "hotspot": ("mapping",)}
 """Sections of a mission that an estimate comes from."""
 NAMES_SHOWN = 30
+CEILING_HINT = "fly lower, raise failsafes.fence.ceiling_m, or set failsafes.fence.action to none"
 
 
 def read_settings(document: Document, near: Path | None) -> tuple[list[PolicySettings | None], list[Problem]]:
@@ -94,6 +95,7 @@ def check_phases(scenario: Scenario) -> Iterator[Problem]:
         yield from _check_landing(scenario, i)
         yield from _check_needs(scenario, i)
         yield from _check_speeds(scenario, i)
+        yield from _check_height(scenario, i)
 
 
 def _check_names(scenario: Scenario) -> Iterator[Problem]:
@@ -305,3 +307,19 @@ def _speed_limits(vehicle: Multirotor | SkidSteer, name: str) -> list[tuple[str,
         ]
     fastest = min(vehicle.control.speed_max_m_s, vehicle.motor.speed_max_rad_s * vehicle.wheels.radius_m)
     return [("speed_m_s", fastest, f"{faster} drive")]
+
+
+def _check_height(scenario: Scenario, i: int) -> Iterator[Problem]:
+    """A phase that flies above the ceiling of the fence, whose failsafe would end it on the way up."""
+    settings, fence = scenario.settings[i], scenario.mission.failsafes.fence
+    if fence.action == "none" or not isinstance(settings, ParallelLines | Orbit | Waypoints | LandOn):
+        return
+    altitude = settings.altitude_m
+    if altitude is not None and altitude >= fence.ceiling_m:
+        yield scenario.problem(
+            ("phases", i, "settings", "altitude_m"),
+            f"is not below the fence's ceiling: on the way up the failsafe would take over (action {fence.action})",
+            given=f"{altitude:g}",
+            allowed=f"less than {fence.ceiling_m:g} (failsafes.fence.ceiling_m)",
+            suggestion=CEILING_HINT,
+        )

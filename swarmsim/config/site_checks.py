@@ -9,18 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from swarmsim.config.documents import Place
-from swarmsim.config.errors import Problem, first_problems
+from swarmsim.config.errors import InputError, Problem, first_problems
+from swarmsim.config.phases import CEILING_HINT
 from swarmsim.config.policies import ApproachAndOrbit, Orbit, ParallelLines, Waypoints, line_spacing
 from swarmsim.config.scenario import Scenario
-from swarmsim.config.site_ground import Ground, point_text
+from swarmsim.config.site_ground import Floats, Ground, point_text
 from swarmsim.config.sources import points_of
 from swarmsim.config.start_checks import check_starts
+from swarmsim.config.vehicles import Multirotor
 
 if TYPE_CHECKING:
     from swarmsim.site import SiteModel
 
 
 ROUNDING_M = 1e-3  # of places in float32
+ABOVE_M = 0.5  # over the ceiling: by less a path that cuts a corner may stay below it
 
 
 def check_site(scenario: Scenario, model: SiteModel | None = None) -> list[Problem]:
@@ -33,7 +36,7 @@ def check_site(scenario: Scenario, model: SiteModel | None = None) -> list[Probl
 
         model = load_site(scenario.site_file, tuple(scenario.materials))
     ground = Ground(model.site, scenario)
-    checks = (_check_sources, check_starts, _check_areas, _check_fence, _check_points)
+    checks = (_check_sources, check_starts, _check_areas, _check_fence, _check_points, _check_ceiling, _check_map)
     return first_problems(problem for check in checks for problem in check(scenario, ground))
 
 
@@ -100,10 +103,8 @@ def _check_fence(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     surveys = [(i, own) for i, own in enumerate(scenario.settings) if isinstance(own, ParallelLines)]
     if fence.action == "none" or not surveys:
         return
-    import jax
     import jax.numpy as jnp
 
-    from swarmsim.policies.coverage import lines_needed, survey_lines
     from swarmsim.world.failsafes import stopping_m
 
     for i, own in surveys:
@@ -112,10 +113,7 @@ def _check_fence(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
         area, sweep, spacing = np.array(own.area_m or ground.area), math.radians(own.sweep_deg), line_spacing(own)
         if not all(ground.holds(corner) for corner in area):  # told of already
             continue
-        lines = lines_needed(area, spacing, sweep)
-        cut = jax.jit(survey_lines, static_argnums=3)  # one by one its operations take a second to compile
-        start, end, used = cut(jnp.asarray(area), jnp.float32(sweep), jnp.float32(spacing), lines)
-        first, last = np.asarray(start, float)[np.asarray(used)], np.asarray(end, float)[np.asarray(used)]
+        first, last = _survey_lines(area, sweep, spacing)
         stop = float(stopping_m(jnp.float32(own.speed_m_s), brake))
         onward = stop * np.array([math.cos(sweep), math.sin(sweep)])
         ends, ahead = np.concatenate([first, last]), np.concatenate([first - onward, last + onward])
@@ -135,6 +133,52 @@ def _check_fence(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
             )
 
 
+def _survey_lines(area: Floats, sweep: float, spacing: float) -> tuple[Floats, Floats]:
+    """Ends [L, 2], [L, 2] of the lines of a survey over ``area`` [V, 2] in the direction ``sweep`` (rad)."""
+    import jax
+    import jax.numpy as jnp
+
+    from swarmsim.policies.coverage import lines_needed, survey_lines
+
+    cut = jax.jit(survey_lines, static_argnums=3)  # one by one its operations take a second to compile
+    lines = lines_needed(area, spacing, sweep)
+    start, end, used = cut(jnp.asarray(area), jnp.float32(sweep), jnp.float32(spacing), lines)
+    return np.asarray(start, float)[np.asarray(used)], np.asarray(end, float)[np.asarray(used)]
+
+
+def _check_ceiling(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
+    """Survey lines and waypoints over things so high that the way above them leads through the fence's ceiling."""
+    fence = scenario.mission.failsafes.fence
+    if fence.action == "none":
+        return
+    for i, own in enumerate(scenario.settings):
+        flies = any(isinstance(scenario.vehicles[k], Multirotor) for k in scenario.phase_members[i])
+        if not flies or not isinstance(own, ParallelLines | Waypoints) or (own.altitude_m or 0.0) >= fence.ceiling_m:
+            continue  # too high over bare ground is told without a site
+        if isinstance(own, ParallelLines):
+            area = np.array(own.area_m or ground.area)
+            ends = np.stack(_survey_lines(area, math.radians(own.sweep_deg), line_spacing(own)), axis=1)
+        else:
+            corners = np.array(own.points)
+            ends = np.stack([corners[:-1], corners[1:]], axis=1)
+        for first, last in ends:
+            xy = np.linspace(first, last, max(2, math.ceil(math.dist(first, last) / ground.cell)))
+            over = ground.rises(xy) + own.obstacle_clearance_m
+            over = np.minimum(over[:-1], over[1:])  # what is narrower than a cell may fall between a path's points
+            worst = int(np.argmax(over))
+            if over[worst] > fence.ceiling_m + ABOVE_M:
+                field = "points" if isinstance(own, Waypoints) else "area_m" if own.area_m is not None else "altitude_m"
+                yield scenario.problem(
+                    ("phases", i, "settings", field),
+                    f"the way leads {over[worst]:.3g} m above the terrain, over what stands there, and the fence's "
+                    f"ceiling is lower: the failsafe would take over (action {fence.action})",
+                    given=f"obstacle_clearance_m {own.obstacle_clearance_m:g}, at {point_text(xy[worst])}",
+                    allowed=f"less than {fence.ceiling_m:g} m (failsafes.fence.ceiling_m)",
+                    suggestion=CEILING_HINT,
+                )
+                break
+
+
 def _check_points(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     """Waypoints and targets beyond the site."""
     for i, settings in enumerate(scenario.settings):
@@ -148,3 +192,18 @@ def _check_points(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
                 message = f"the {'waypoint' if place[0] == 'points' else 'target'} lies outside the site"
                 given = str(list(point))
                 yield scenario.problem(("phases", i, "settings", *place), message, given=given, allowed=ground.extent)
+
+
+def _check_map(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
+    """A map of more cells or basis functions than can be computed."""
+    mapping = scenario.mission.mapping
+    if mapping is None or not scenario.detectors:
+        return
+    from swarmsim.missions.plan_build import kept_mapping, mapped_area
+
+    try:
+        kept_mapping(mapping, mapped_area(scenario, ground.site.survey_area_m))
+    except InputError as error:
+        for told in error.problems:
+            details = {"given": told.given, "allowed": told.allowed, "suggestion": told.suggestion}
+            yield scenario.problem(tuple((told.path or "").split(".")), told.message, **details)

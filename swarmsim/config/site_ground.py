@@ -70,6 +70,13 @@ class Ground:
 
         return sample_on_host(self.site.clearance_m, self.site, xy)
 
+    def rises(self, xy: Floats) -> Floats:
+        """How far the highest surface rises above the terrain [p] at points [p, 2], bilinear as paths are planned."""
+        from swarmsim.site.model import sample_on_host
+
+        rises: Floats = sample_on_host(self.surface, self.site, xy) - sample_on_host(self.terrain, self.site, xy)
+        return rises
+
     def least_clearance(self, xy: Floats) -> float:
         """Least clearance of a rover at points [p, 2]."""
         return float(np.min(self.clearances(xy)))

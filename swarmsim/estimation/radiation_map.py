@@ -24,6 +24,7 @@ Basis = tuple[Floats, Floats, Floats]  # support [g], projection [g, p], values 
 
 VARIANCE_KEPT = 0.95  # of the prior's variance in the basis, mean over the map
 RANK_MAX = 1024  # a larger basis would take seconds and hundreds of megabytes
+RANK_SURELY = 1.5  # length scales of the area (each side and one more) over the rank are at most 1.3
 CELLS_MAX = 250_000
 CHUNK = 128  # samples taken into the normal equations at a time: bounds the memory of large batches
 
@@ -78,12 +79,17 @@ def mapping_params(spec: Mapping, area_m: ArrayLike, variance_kept: float = VARI
     shape = np.maximum(np.ceil(extent / spec.cell_m - 1e-6).astype(int), 1)
     if shape.prod() > CELLS_MAX:
         raise InputError.of(
-            f"mapping.cell_m of {spec.cell_m:g} m makes a map of {shape[0]} x {shape[1]} cells over an area of "
-            f"{extent[0]:.0f} x {extent[1]:.0f} m; at most {CELLS_MAX} cells are possible: give a larger cell_m or a "
-            "smaller area"
+            f"makes a map of {shape[0]} x {shape[1]} cells over an area of {extent[0]:.0f} x {extent[1]:.0f} m",
+            path="mapping.cell_m",
+            given=f"{spec.cell_m:g}",
+            allowed=f"at most {CELLS_MAX} cells",
+            suggestion="give a larger cell_m or a smaller area",
         )
     origin = low + 0.5 * (extent - (shape - 1) * spec.cell_m)
     cells = [origin[i] + spec.cell_m * np.arange(shape[i]) for i in range(2)]
+    least = np.prod([np.ptp(each) / spec.length_scale_m + 1.0 for each in cells])
+    if least > RANK_SURELY * RANK_MAX:  # told before the eigenproblems, which could take hours
+        raise _too_short(spec.length_scale_m, f"about {least:.3g}")
     bases = [_basis(c, spec.length_scale_m) for c in cells]
     pairs = _pairs(bases, variance_kept, spec.length_scale_m)
     (support_x, project_x, columns), (support_y, project_y, rows) = (
@@ -133,12 +139,19 @@ def _pairs(bases: list[Basis], variance_kept: float, length_scale: float) -> tup
     order = np.argsort(-variance, kind="stable")
     rank = int(np.searchsorted(np.cumsum(variance[order]), variance_kept)) + 1
     if rank > RANK_MAX:
-        raise InputError.of(
-            f"mapping.length_scale_m of {length_scale:g} m is too short for the size of the survey area (it needs "
-            f"{rank} basis functions, at most {RANK_MAX} are possible): give a longer length_scale_m or a smaller area"
-        )
+        raise _too_short(length_scale, str(rank))
     i, j = np.unravel_index(order[:rank], (x.size, y.size))
     return i, j
+
+
+def _too_short(length_scale: float, rank: str) -> InputError:
+    return InputError.of(
+        f"is too short for the size of the survey area: the map would need {rank} basis functions",
+        path="mapping.length_scale_m",
+        given=f"{length_scale:g}",
+        allowed=f"at most {RANK_MAX} basis functions",
+        suggestion="give a longer length_scale_m or a smaller area",
+    )
 
 
 def interpolate(params: MappingParams, measurements: Measurements, windows: jax.Array | float = 1.0) -> RadiationMap:

@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from swarmsim.config.mission import Mapping
 from swarmsim.config.mission import Phase as PhaseSpec
@@ -50,12 +51,12 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
     localisation, identification = mission.localisation, mission.identification
     per_window, windows = _windows(scenario, world)
     mapping = presumed = None
-    corners = _surveyed(scenario, site_model)
+    corners = mapped_area(scenario, site_model.site.survey_area_m)
     if localisation is not None and detectors:
         ground_share = mission.background.ground_share
         presumed = presume(site_model.site, detectors, localisation, mission.knowledge, ground_share, corners)
     if mission.mapping is not None and detectors:
-        mapping = _kept_mapping(mission.mapping, tuple(map(tuple, corners.tolist())))
+        mapping = kept_mapping(mission.mapping, corners)
     return Plan(
         site=site_model.site,
         detectors=detectors,
@@ -83,20 +84,25 @@ def _trail(scenario: Scenario, world: World) -> int:
     return 2 + sum(math.ceil(phase.time_limit_s / world.timing.decision_period_s) + 1 for phase in phases)
 
 
+def kept_mapping(mapping: Mapping, corners: np.ndarray) -> MappingParams:
+    """The map's grid and basis functions over ``corners`` [V, 2]; raises `InputError` as `mapping_params` does."""
+    return _kept_mapping(mapping, tuple(map(tuple, corners.tolist())))
+
+
 @kept(4)
 def _kept_mapping(mapping: Mapping, corners: tuple[tuple[float, ...], ...]) -> MappingParams:
     """Missions of a family share the map's basis functions, which take 0.2 s for a large map."""
     return mapping_params(mapping, np.array(corners))
 
 
-def _surveyed(scenario: Scenario, site_model: SiteModel) -> np.ndarray:
-    """Corners [V, 2] of what the map covers: the areas that phases survey, or the site's survey area."""
+def mapped_area(scenario: Scenario, survey_area_m: ArrayLike) -> np.ndarray:
+    """Corners [V, 2] of what the map covers: the areas that phases survey, or the site's survey area [U, 2]."""
     surveys = [s for s in scenario.settings if isinstance(s, ParallelLines)]
     areas = [np.array(s.area_m) for s in surveys if s.area_m is not None]
     whole = any(s.area_m is None for s in surveys)
     if areas and not whole:
         return np.concatenate(areas)
-    return np.concatenate([np.asarray(site_model.site.survey_area_m), *areas])
+    return np.concatenate([np.asarray(survey_area_m), *areas])
 
 
 def _windows(scenario: Scenario, world: World) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -289,3 +289,27 @@ def test_a_trigger_is_validated_in_python_too(mission: Path) -> None:
     assert made.phases[1].who == ("orpheus",)
     with pytest.raises(ValueError, match="exactly one"):
         type(made.phases[0].start)(delay_s=3.0)
+
+
+@pytest.mark.parametrize(
+    ("phase", "place"),
+    [
+        ("phases.survey.settings.altitude_m=30", "phases.0.settings.altitude_m"),
+        (
+            "phases.1={name: b, who: uav1, policy: orbit, time_limit_s: 60, start: {after: survey}, "
+            "settings: {radius_m: 5, altitude_m: 25.5, speed_m_s: 1}}",
+            "phases.1.settings.altitude_m",
+        ),
+        (
+            "phases.1={name: b, who: uav1, policy: waypoints, time_limit_s: 60, "
+            "settings: {points: [[0, 0]], altitude_m: 25, speed_m_s: 1}}",
+            "phases.1.settings.altitude_m",
+        ),
+    ],
+)
+def test_a_phase_above_the_ceiling_of_the_fence(mission: Path, phase: str, place: str) -> None:
+    message = message_of(mission, phase, "failsafes.fence={ceiling_m: 25}")
+    assert f"{place}: is not below the fence's ceiling" in message
+    assert "less than 25 (failsafes.fence.ceiling_m)" in message
+    load_scenario(mission, [phase, "failsafes.fence={ceiling_m: 25, action: none}"])
+    load_scenario(mission, [phase, "failsafes.fence={ceiling_m: 31}"])

@@ -20,6 +20,11 @@ ROUND = (
     "{name: b, who: orpheus, policy: waypoints, settings: {speed_m_s: 1, points: [[0, 30], [0, -71]]}, time_limit_s: 9}"
 )
 
+OVER = (
+    "{name: b, who: uav1, policy: waypoints, time_limit_s: 9, "
+    "settings: {speed_m_s: 1, altitude_m: 9, points: [[-60, 24], [60, 24]]}}"
+)
+
 # 160 m x 140 m around the origin, 2 m high ground. Boxes: a building of 20 x 10 x 6 m with walls of 0.3 m, turned by
 # 90 degrees; a solid wall of 20 x 1 x 4 m; a hedge of 4 x 4 x 2 m; a place holder of no size.
 CENTRES = [[0.0, 0.0, 5.0], [40.0, 20.0, 4.0], [-30.0, 30.0, 3.0], [0.0, 0.0, 2.0]]
@@ -77,6 +82,8 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
         ("vehicles.orpheus.position_m=[-75, 0]", "vehicles.3.position_m", ["'orpheus' starts where a rover cannot"]),
         (f"{SURVEY}.area_m=[[0, 0], [200, 0], [0, 60]]", f"{FIRST}.area_m", ["reaches beyond the site", "[200, 0]"]),
         (f"{SURVEY}.area_m=[[0, 0], [5, 0], [5, 60], [0, 60]]", f"{FIRST}.area_m", ["no room for one", "10 m"]),
+        ("mapping.cell_m=0.05", "mapping.cell_m", ["a map of 2800 x 2400 cells", "at most 250000", "larger cell_m"]),
+        ("mapping.length_scale_m=0.01", "mapping.length_scale_m", ["too short", "at most 1024", "given:   0.01"]),
         (f"{SURVEY}.line_spacing_m=130", FIRST, ["no room for one survey line", "smaller line_spacing_m"]),
         (
             f"{SURVEY}.area_m=[[-79, -60], [70, -60], [70, 60], [-79, 60]]", f"{FIRST}.area_m",
@@ -156,3 +163,25 @@ def test_everything_is_told_at_once_with_lines(mission: Path, site: SiteModel) -
         ("sources.0.position_m", line_of(mission, "[90.0")),
         ("vehicles.2.position_m", line_of(mission, "[45.0")),
     ]
+
+
+@pytest.mark.parametrize(
+    ("override", "path", "given"),
+    [
+        ("mapping.cell_m=2", "phases.0.settings.altitude_m", "24 m above the terrain"),
+        (f"{SURVEY}.area_m=[[0, 0], [50, 0], [50, 60], [0, 60]]", f"{FIRST}.area_m", "given:   obstacle_clearance_m 5"),
+        (f"phases.1={OVER}", "phases.1.settings.points", "over what stands there"),
+    ],
+)
+def test_a_way_over_a_thing_that_reaches_to_the_ceiling(
+    mission: Path, site: SiteModel, override: str, path: str, given: str
+) -> None:
+    surface = np.array(site.site.surface_m)
+    surface[90:97, 100:130] += 19.0  # a tower of 30 m by 7 m, and a mast of a single cell
+    surface[20, 20] += 90.0
+    high = replace(site, site=replace(site.site, surface_m=jnp.array(surface)))
+    problems = check_site(load_scenario(mission, [override, "failsafes.fence.ceiling_m=22"]), high)
+    assert path in [problem.path for problem in problems]
+    assert given in "".join(str(problem) for problem in problems if problem.path == path)
+    assert check_site(load_scenario(mission, [override, "failsafes.fence.ceiling_m=25"]), high) == []
+    assert check_site(load_scenario(mission, [override, "failsafes.fence={ceiling_m: 22, action: none}"]), high) == []
