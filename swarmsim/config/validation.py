@@ -84,8 +84,9 @@ def _problem(details: ErrorDetails, place: Place, document: Document, shape: Sha
         return document.problem(
             place, f"there is no field '{name}' here", allowed=one_of(fields), suggestion=did_you_mean(name, fields)
         )
-    given = None if kind == "value_error" and isinstance(details["input"], dict) else shown(details["input"])
-    allowed = shape.describe(place, data)
+    whole = kind == "value_error" and isinstance(details["input"], dict)  # its sentence says what is wrong in there
+    given = None if whole else shown(details["input"])
+    allowed = None if whole else shape.describe(place, data)
     if kind == "missing" and isinstance(details["loc"][-1], str):
         return document.problem(place, "this field is missing", allowed=allowed)
     if kind in ("union_tag_invalid", "union_tag_not_found"):

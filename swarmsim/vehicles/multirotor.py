@@ -193,7 +193,7 @@ def control_params(spec: Multirotor, air: RotorAir) -> ControlParams:
     numbers = {
         "mass_kg": spec.mass_kg,
         "inertia_kg_m2": moments,
-        "allocation": np.linalg.pinv(effectiveness(spec)),
+        "allocation": np.linalg.pinv(spec.effectiveness),
         "thrust_coefficient_n_s2": rotor.thrust_coefficient_n_s2,
         "speed_min_rad_s": rotor.speed_min_rad_s,
         "speed_max_rad_s": rotor.speed_max_rad_s,
@@ -218,13 +218,6 @@ def control_params(spec: Multirotor, air: RotorAir) -> ControlParams:
     numbers["rolling_moment_ns"] = float(air.rolling_moment_kg_m) * level
     numbers["climb_damping_1_s"] = 0.5 * len(spec.rotors) * inflow / spec.mass_kg
     return ControlParams(**_float32(numbers), principal_axes=None if axes is None else on_device(axes))
-
-
-def effectiveness(spec: Multirotor) -> np.ndarray:
-    """Matrix [4, R] from rotor thrusts (N) to total thrust (N) and torque x, y, z (N m, body)."""
-    arms = np.array([r.position_m for r in spec.rotors])
-    yaw = -_spins(spec) * spec.rotor.moment_constant_m
-    return np.stack([np.ones(len(arms)), arms[:, 1], -arms[:, 0], yaw])
 
 
 def rotor_speeds(

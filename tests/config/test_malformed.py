@@ -321,6 +321,25 @@ def test_a_vehicle_of_no_kind(tmp_path: Path) -> None:
             load_model(tmp_path / "v.yaml", Vehicle)
 
 
+ROTORS = {
+    "on one line": (["0.1, 0.2", "0.2, 0.4", "0.3, 0.6", "0.4, 0.8"], "stand on one line seen from above"),
+    "at one point": (["0.1, 0.2"] * 4, "stand at one point seen from above"),
+    "in the middle": (["0.0, 0.0"] * 4, "stand at one point seen from above"),
+    "of one sense on each side": (["0.2, 0.2", "0.2, -0.2", "-0.2, 0.2", "-0.2, -0.2"], "neighbours that turn opposite"),
+    "three": (["0.2, 0.2", "0.2, -0.2", "-0.2, 0.0"], "it takes four or more"),
+    "in front": (["1.2, 0.2", "0.8, 0.2", "1.2, -0.2", "0.8, -0.2"], "cannot hold the vehicle level: it takes thrusts of"),
+}
+
+
+@pytest.mark.parametrize(("places", "fragment"), ROTORS.values(), ids=ROTORS)
+def test_rotors_that_cannot_hold_a_vehicle(mission: Path, places: list[str], fragment: str) -> None:
+    spins = ["ccw", "ccw", "cw", "cw"] if "neighbours" in fragment else ["ccw", "cw", "cw", "ccw"]
+    rotors = [f"{{position_m: [{xy}, 0.05], spin: {spin}}}" for xy, spin in zip(places, spins, strict=False)]
+    message = message_of(mission, f"definitions.vehicles.tarot_t650.rotors=[{', '.join(rotors)}]")
+    assert fragment in message
+    assert "allowed" not in message
+
+
 def test_load_model_tells_the_same(mission: Path) -> None:
     spoil(mission, "seed: 0", "seed: zero")
     with pytest.raises(InputError, match=r"recon\.yaml:6 seed: is not a whole number"):
