@@ -17,11 +17,11 @@ from swarmsim.cli.run import value_text
 from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS
-from swarmsim.config.checks import sensors_twice
 from swarmsim.config.documents import read_file, shown_path
 from swarmsim.config.errors import InputError, Problem, file_errors_told, raise_if_any
 from swarmsim.config.load import load_all, load_named
-from swarmsim.config.names import did_you_mean, one_of
+from swarmsim.config.names import one_of
+from swarmsim.config.references import load_detector, load_vehicle
 from swarmsim.config.sensors import SENSOR_KINDS
 
 _TOLD_BY_KIND = ("vehicles", "sensors")  # unions of models, which the field ``kind`` tells apart
@@ -74,30 +74,12 @@ def check_file(path: Path) -> tuple[str, list[str]]:
 
         warnings = load_site(path, tuple(load_all("materials", path))).report["warnings"]
     elif kind == "vehicles":
-        _check_sensors(load_named(kind, path), path)
+        load_vehicle(path)
+    elif kind == "detectors":
+        load_detector(path)
     else:
         load_named(kind, path)
     return kind.removesuffix("s"), warnings
-
-
-def _check_sensors(vehicle: Any, path: Path) -> None:
-    """Raise `InputError` where a vehicle names a sensor that there is not, or two of a kind."""
-    file, known = shown_path(path), files.available("sensors", path)
-    raise_if_any(
-        [
-            Problem(
-                f"there is no sensor '{name}'",
-                file=file,
-                path="sensors",
-                allowed=one_of(known),
-                suggestion=did_you_mean(name, known),
-            )
-            for name in vehicle.sensors
-            if name not in known
-        ]
-    )
-    told = sensors_twice(vehicle, {name: load_named("sensors", name, path) for name in vehicle.sensors})
-    raise_if_any([Problem(sentence, file=file, path="sensors") for sentence in told])
 
 
 def _check_autopilot(path: Path) -> str:

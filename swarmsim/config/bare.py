@@ -29,7 +29,7 @@ def bare_scenario(whole: Scenario, numbers: Sequence[int], name: str, timing: Ti
         failsafes=Failsafes(
             fence=Fence(action="none"), wind=WindFailsafe(action="none"), battery=BatteryFailsafe(action="none")
         ),
-        definitions=Definitions(vehicles=types, sensors=dict(whole.sensors)),
+        definitions=Definitions(vehicles=types, sensors=dict(whole.sensors), materials=dict(whole.materials)),
         **{field: getattr(whole.mission, field) for field in _KEPT},
     )
     return scenario_of(mission, whole.mission_file)

@@ -1,22 +1,22 @@
-"""What no single field can tell: names that must exist, and parts of a scenario that must fit together."""
+"""What no single field can tell: parts of a scenario that must fit together."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from swarmsim.config import files
-from swarmsim.config.allowed import item
 from swarmsim.config.documents import Document, Place
-from swarmsim.config.errors import PROBLEMS_MAX, Problem, first_problems
+from swarmsim.config.errors import Problem, first_problems
+from swarmsim.config.load import read_document
 from swarmsim.config.mission import TEAM_MAX, Mission
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.phases import check_phases
-from swarmsim.config.sensors import AnySensor
+from swarmsim.config.radiation import CRYSTAL_MAX_KEV
+from swarmsim.config.references import Wanted, materials_of, missing, sensors_twice
 from swarmsim.config.site import SiteSpec
 from swarmsim.config.sources import POINTS_MAX, points_of
 from swarmsim.config.team import RESERVED, team_size
@@ -25,48 +25,8 @@ from swarmsim.config.vehicles import Multirotor, SkidSteer
 if TYPE_CHECKING:
     from swarmsim.config.scenario import Scenario
 
+AIR = "air"
 PAIRS_MAX = 50_000  # of vehicles that start too near to each other: sorting all pairs of a large team takes seconds
-
-
-def check_references(document: Document, near: Path | None) -> list[Problem]:
-    """Names in a mission's document that name nothing: site, vehicle types, nuclides.
-
-    Works on the plain data, so that wrong names are told together with wrong values; values of a wrong type are left to
-    the validation.
-    """
-    data = document.data
-    problems: list[Problem] = []
-
-    def check(what: str, place: Place, known: Iterable[str]) -> None:
-        value: Any = data
-        for step in place:
-            value = item(value, step)
-        if isinstance(value, str) and value not in (known := list(known)):
-            if len(problems) > PROBLEMS_MAX:
-                return
-            allowed, hint = one_of(known), did_you_mean(value, known)
-            problems.append(document.problem(place, f"there is no {what} '{value}'", allowed=allowed, suggestion=hint))
-
-    check("site", ("site",), files.available("sites", near))
-    types, nuclides = known_names(data, "vehicles", near), known_names(data, "nuclides", near)
-    for i in _indices(item(data, "vehicles")):
-        check("vehicle type", ("vehicles", i, "type"), types)
-    for i in _indices(item(data, "sources")):
-        check("nuclide", ("sources", i, "nuclide"), nuclides)
-    named = item(item(data, "knowledge"), "nuclides")
-    for i in _indices(named if isinstance(named, list | tuple) else None):
-        check("nuclide", ("knowledge", "nuclides", i), nuclides)
-    return problems
-
-
-def known_names(data: Any, kind: str, near: Path | None) -> list[str]:
-    """Names of a kind that a mission may use: its own definitions, and what the configuration folders hold."""
-    definitions = item(data, "definitions")
-    own = item(definitions, kind)
-    names = set(own) if isinstance(own, dict) else set()
-    if item(definitions, "complete") is not True:
-        names |= set(files.available(kind, near))
-    return sorted(names)
 
 
 def check_team_size(mission: Mission, document: Document) -> list[Problem]:
@@ -78,54 +38,6 @@ def check_team_size(mission: Mission, document: Document) -> list[Problem]:
     return [document.problem(("vehicles",), "has too many vehicles", given=str(size), allowed=allowed)]
 
 
-def check_detectors(
-    mission: Mission, vehicles: Sequence[Multirotor | SkidSteer], document: Document, near: Path | None
-) -> list[Problem]:
-    """Vehicle types (``vehicles``: of each entry of ``mission.vehicles``) with a detector that does not exist."""
-    known = known_names(document.data, "detectors", near)
-    problems, told = [], set()
-    for i, (member, vehicle) in enumerate(zip(mission.vehicles, vehicles, strict=True)):
-        if vehicle.detector is None or vehicle.detector.model in known or member.type in told:
-            continue
-        told.add(member.type)
-        name = vehicle.detector.model
-        message = f"the vehicle type '{member.type}' carries a detector '{name}' that does not exist"
-        hint = did_you_mean(name, known)
-        problems.append(document.problem(("vehicles", i, "type"), message, allowed=one_of(known), suggestion=hint))
-    return problems
-
-
-def check_sensors(
-    mission: Mission, vehicles: Sequence[Multirotor | SkidSteer], document: Document, near: Path | None
-) -> list[Problem]:
-    """Vehicle types (``vehicles``: of each entry of ``mission.vehicles``) with a sensor that does not exist."""
-    known = known_names(document.data, "sensors", near)
-    problems = []
-    types = {
-        member.type: (i, vehicle) for i, (member, vehicle) in enumerate(zip(mission.vehicles, vehicles, strict=True))
-    }
-    for name, (i, vehicle) in types.items():
-        for sensor in vehicle.sensors:
-            if sensor not in known:
-                message = f"the vehicle type '{name}' carries a sensor '{sensor}' that does not exist"
-                hint = did_you_mean(sensor, known)
-                place: Place = ("vehicles", i, "type")
-                problems.append(document.problem(place, message, allowed=one_of(known), suggestion=hint))
-    return problems
-
-
-def sensors_twice(vehicle: Multirotor | SkidSteer, sensors: Mapping[str, AnySensor]) -> list[str]:
-    """A sentence for each sensor of a vehicle that is the second of its kind."""
-    first: dict[str, str] = {}
-    told = []
-    for name in vehicle.sensors:
-        kind = sensors[name].kind
-        if kind in first:
-            told.append(f"'{vehicle.name}' carries two sensors of the kind {kind}: '{first[kind]}' and '{name}'")
-        first.setdefault(kind, name)
-    return told
-
-
 def check_consistency(scenario: Scenario) -> list[Problem]:
     """Everything that the parts of a scenario get wrong together, in the order of the mission's file."""
     checks = (
@@ -133,6 +45,7 @@ def check_consistency(scenario: Scenario) -> list[Problem]:
         _check_sensors,
         _check_timing,
         _check_materials,
+        _check_lines,
         _check_names,
         _check_sources,
         _check_pads,
@@ -152,10 +65,6 @@ def footprint_radius_m(vehicle: Multirotor | SkidSteer) -> float:
         math.hypot(max(length, wheels.wheel_base_m + 2 * wheels.radius_m), max(width, wheels.track_m + wheels.width_m))
         / 2
     )
-
-
-def _indices(value: Any) -> range:
-    return range(len(value)) if isinstance(value, list) else range(0)
 
 
 def _check_definitions(scenario: Scenario) -> Iterator[Problem]:
@@ -194,6 +103,13 @@ def _check_timing(scenario: Scenario) -> Iterator[Problem]:
                 allowed=nearest,
                 suggestion=f"change timing.control_period_s, or set definitions.detectors.{name}.sample_period_s",
             )
+        elif detector.sample_period_s < timing.judge_period_s - 0.5 * timing.control_period_s:
+            yield scenario.problem(
+                ("timing", "judge_period_s"),
+                f"is longer than the sample_period_s of the detector '{name}'",
+                given=f"{timing.judge_period_s:g}",
+                allowed=f"at most {detector.sample_period_s:g}",
+            )
 
 
 def _nearest_multiples(period: float, unit: float) -> str | None:
@@ -207,18 +123,34 @@ def _nearest_multiples(period: float, unit: float) -> str | None:
 
 
 def _check_materials(scenario: Scenario) -> Iterator[Problem]:
-    site, materials = scenario.site, scenario.materials
-    made = f"the site '{site.name}' is made of"
-    wanted: list[tuple[Place, str, str]] = [(("site",), made, name) for name in _site_materials(site)]
+    site = scenario.site
+    wanted: list[Wanted] = [(("definitions",), "what lies between obstacles is of a material", AIR)]
+    made = f"the site '{site.name}' is made of a material"
+    wanted += [(("site",), made, name) for name in _site_materials(site)]
     for detector in scenario.detectors.values():
-        for name in filter(None, (detector.crystal, detector.housing.material)):
-            wanted.append((("vehicles",), f"the detector '{detector.name}' is made of", name))
+        wanted += [(("vehicles",), who, name) for _, who, name in materials_of(detector)]
     for name in scenario.mission.background.surfaces:
-        wanted.append((("background", "surfaces", name), "a surface is of", name))
-    for where, who, name in wanted:
-        if name not in materials:
-            message, hint = f"{who} a material '{name}' that does not exist", did_you_mean(name, materials)
-            yield scenario.problem(where, message, allowed=one_of(materials), suggestion=hint)
+        wanted.append((("background", "surfaces", name), "a surface is of a material", name))
+    yield from missing(scenario.problem, wanted, scenario.materials)
+
+
+def _check_lines(scenario: Scenario) -> Iterator[Problem]:
+    """Lines that no crystal's response reaches: tables of a scintillator are made for every nuclide that there is."""
+    if all(detector.crystal is None for detector in scenario.detectors.values()):
+        return
+    own = scenario.mission.definitions.nuclides
+    known = files.available("nuclides", scenario.mission_file)
+    for name, nuclide in scenario.nuclides.items():
+        for k, line in enumerate(nuclide.lines):
+            if line.energy_kev <= CRYSTAL_MAX_KEV:
+                continue
+            place: Place = ("lines", k, "energy_kev")
+            message = "lies beyond the response of the team's scintillators"
+            details = {"given": f"{line.energy_kev:g}", "allowed": f"at most {CRYSTAL_MAX_KEV:g}"}
+            if name in own:
+                yield scenario.problem(("definitions", "nuclides", name, *place), message, **details)
+            else:
+                yield read_document(known[name], "nuclides").problem(place, message, **details)
 
 
 def _site_materials(site: SiteSpec) -> list[str]:

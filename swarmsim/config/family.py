@@ -20,10 +20,11 @@ CAN_VARY = (
     "what leaves names, sizes and structure as they are: sources.*.nuclide, position_m, height_m and activity_mbq, the "
     "number of sources (sources: {count: [1, 3]}), vehicles.*.position_m and heading_deg, wind, failsafes, traffic, "
     "radio.range_m and radio.loss, most numbers of mapping, localisation and identification, phases.*.settings, "
-    "phases.*.start.at_s and delay_s, and numbers in definitions"
+    "phases.*.start.at_s and delay_s, and numbers in definitions other than materials"
 )
 _FIXED_SECTIONS = {
     "name", "description", "site", "seed", "engine", "detection", "timing", "versions", "vary", "effects",
+    "autopilot",
 }  # fmt: skip
 _FIXED_FIELDS = {
     "vehicles": {"name", "type", "formation"},
@@ -226,6 +227,7 @@ def _check(document: Document, key: str, place: Place, schema: Schema, drawn: Di
     source = place[0] == "sources" and len(place) >= 3
     fixed = place[2] in _FIXED_FIELDS.get(str(place[0]), ()) if len(place) > 2 else place[0] in ("vehicles", "phases")
     late = place[0] == "phases" and place[2:] in (("start",), ("start", "after"), ("start", "when"))
+    fixed |= place[:2] == ("definitions", "materials")  # the site's walls are made of them once for all missions
     if fixed or late or place in _FIXED_PLACES or place[-1] == "name" or (place[0] == "sources" and not source):
         raise InputError([_refused(document, key)])
     for kind, field in (("place", "position_m"), ("any_nuclide", "nuclide")):

@@ -1,6 +1,7 @@
 """Dotted overrides from the command line: ``wind.speed_m_s=3``, ``phases.survey.settings.altitude_m=30``."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from swarmsim.config.allowed import Shape
@@ -13,22 +14,24 @@ from swarmsim.config.vary import DISTRIBUTIONS
 ORIGIN = "--set"
 
 
-def apply_overrides(document: Document, overrides: Sequence[str], shape: Shape) -> None:
+def apply_overrides(document: Document, overrides: Sequence[str], shape: Shape, origin: str = ORIGIN) -> None:
     """Set each ``path=value`` in the document; raises one `InputError` with everything that is wrong with them.
+
+    ``origin`` is where they were written, for messages.
 
     A list's items are named by index, or by their ``name`` field (``vehicles.uav1.heading_deg=90``); values are YAML.
     """
     problems: list[Problem] = []
     for text in overrides:
         try:
-            _apply(document, text, shape)
+            _apply(document, text, shape, origin)
         except InputError as error:
-            problems += error.problems
+            problems += [replace(problem, file=origin) for problem in error.problems]
     if problems:
         raise InputError(problems)
 
 
-def _apply(document: Document, text: str, shape: Shape) -> None:
+def _apply(document: Document, text: str, shape: Shape, origin: str) -> None:
     path, equals, value_text = text.partition("=")
     steps = path.strip().split(".")
     if not equals or not all(steps):
@@ -54,7 +57,7 @@ def _apply(document: Document, text: str, shape: Shape) -> None:
             if isinstance(node, dict) and node.get(known) is None:
                 node[known] = {}
             node = node[known]
-    document.replace(place, {place: Mark(ORIGIN, None)})
+    document.replace(place, {place: Mark(origin, None)})
 
 
 def _with_whole_path(steps: list[str]) -> list[str]:

@@ -8,6 +8,8 @@ from pydantic import Field, model_validator
 from swarmsim.config.base import Fraction, Model, Name, PhotonEnergy, Vec3
 
 TABLE_MAX = 1000  # rows of a table
+CRYSTAL_MAX_KEV = 3400.0
+"""Greatest energy of a line in a scintillator: that of the Monte Carlo of pulse heights."""
 MassFraction = Annotated[float, Field(ge=1e-9, le=1)]
 CrystalSize = Annotated[float, Field(ge=0.1, le=2000)]  # mm
 DeadTimeUs = Annotated[float, Field(ge=0, le=1e6)]

@@ -3,21 +3,15 @@
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from swarmsim.config import files
-from swarmsim.config.allowed import item, shape_of
-from swarmsim.config.checks import (
-    check_consistency,
-    check_detectors,
-    check_references,
-    check_sensors,
-    check_team_size,
-    known_names,
-)
+from swarmsim.config.allowed import shape_of
+from swarmsim.config.checks import check_consistency, check_team_size
+from swarmsim.config.definitions import bring_in_definitions, unused_definitions
 from swarmsim.config.documents import Document, Place, dump_yaml
 from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.family import Varied, add_sources, read_family, set_and_varied, varied_paths
@@ -27,6 +21,7 @@ from swarmsim.config.overrides import ORIGIN, apply_overrides
 from swarmsim.config.phases import read_settings
 from swarmsim.config.policies import PolicySettings
 from swarmsim.config.radiation import Detector, Material, Nuclide
+from swarmsim.config.references import check_carried, check_references, known_names
 from swarmsim.config.sensors import AnySensor
 from swarmsim.config.site import SiteSpec
 from swarmsim.config.team import chosen, expand_team, groups
@@ -120,14 +115,21 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
     path = files.find("missions", name_or_path)
     document = read_document(path, "missions")
     overrides = (*overrides, f"seed={seed}") if seed is not None else tuple(overrides)
-    problems = [*_bring_in_definitions(document, overrides, path)]
+    problems = bring_in_definitions(document, overrides, path, partial(Problem, file=ORIGIN))
+    unknown = {problem.path for problem in problems}
+    known = [text for text in overrides if text.partition("=")[0].strip() not in unknown]
     try:
-        apply_overrides(document, overrides, shape_of(Mission))
+        apply_overrides(document, known, shape_of(Mission))
     except InputError as error:
         problems += error.problems
-    problems += _bring_in_definitions(document, varied_paths(document), path)
+    varied = varied_paths(document)
+    problems += bring_in_definitions(
+        document, varied, path, lambda message, path, **details: document.problem(("vary", path), message, **details)
+    )
     problems += set_and_varied(document, overrides)
-    return resolve(document, path, problems)
+    scenario = resolve(document, path, problems)
+    raise_if_any(unused_definitions(scenario, overrides))
+    return scenario
 
 
 def scenario_of(mission: Mission, near: Path | None = None) -> Scenario:
@@ -225,8 +227,7 @@ def _look_up(mission: Mission, settings: tuple[PolicySettings, ...], document: D
     raise_if_any(problems)
     assert site is not None
     entered = [types[entry.type] for entry in mission.vehicles]
-    carried_of = (check_detectors(mission, entered, document, near), check_sensors(mission, entered, document, near))
-    raise_if_any([problem for found in carried_of for problem in found])
+    raise_if_any(check_carried(mission, entered, document, near))
     carried = sorted({vehicle.detector.model for vehicle in types.values() if vehicle.detector is not None})
     detectors = {name: gather("detectors", name) for name in carried}
     sensors = {name: gather("sensors", name) for name in sorted({s for v in types.values() for s in v.sensors})}
@@ -258,39 +259,3 @@ def _found_from_anywhere(policy: str, near: Path | None) -> str:
         return policy
     file, _, name = policy.rpartition(":")
     return policy if (Path.cwd() / file).resolve() == path else f"{path}:{name}"
-
-
-def _table(parent: dict[str, Any], key: str) -> dict[str, Any] | None:
-    """The table under a key, a new one where there is nothing; None where there is something else."""
-    if parent.get(key) is None:
-        parent[key] = {}
-    found = parent[key]
-    return found if isinstance(found, dict) else None
-
-
-def _bring_in_definitions(document: Document, overrides: Sequence[str], near: Path) -> list[Problem]:
-    """Copy into ``definitions`` what overrides or `vary` change: ``definitions.vehicles.tarot_t650.mass_kg=4``."""
-    problems: list[Problem] = []
-    for text in overrides:
-        steps = text.partition("=")[0].strip().split(".")
-        if (
-            steps[0] != "definitions"
-            or len(steps) < 4
-            or steps[1] not in ("vehicles", "detectors", "sensors", "nuclides")
-        ):
-            continue
-        place: Place = tuple(steps[:3])
-        if item(item(item(document.data, place[0]), place[1]), place[2]) is not None:
-            continue
-        try:
-            source = read_document(files.find(steps[1], steps[2], near), steps[1])
-        except InputError as error:
-            problems += error.problems
-            continue
-        kinds = _table(document.data, "definitions")
-        named = None if kinds is None else _table(kinds, steps[1])
-        if named is None:
-            continue  # of what is no table the check tells
-        named[steps[2]] = source.data
-        document.marks |= {(*place, *inner): mark for inner, mark in source.marks.items()}
-    return problems

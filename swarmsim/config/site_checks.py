@@ -36,8 +36,27 @@ def check_site(scenario: Scenario, model: SiteModel | None = None) -> list[Probl
 
         model = load_site(scenario.site_file, tuple(scenario.materials))
     ground = Ground(model.site, scenario)
+    if vehicles := first_problems(_check_vehicles(scenario)):
+        return vehicles  # without its body nothing is known of a vehicle's outline
     checks = (_check_sources, check_starts, _check_areas, _check_fence, _check_points, _check_ceiling, _check_map)
     return first_problems(problem for check in checks for problem in check(scenario, ground))
+
+
+def _check_vehicles(scenario: Scenario) -> Iterator[Problem]:
+    """Vehicle types whose body's file is wrong, or whose feet are too stiff for the time step."""
+    from swarmsim.world.build import vehicle_params
+
+    step, told = scenario.mission.timing.time_step_s, set()
+    for entry, member, vehicle in zip(scenario.entries, scenario.members, scenario.vehicles, strict=True):
+        if member.type in told:
+            continue
+        told.add(member.type)
+        try:
+            vehicle_params(vehicle, scenario.mission.effects, step)
+        except InputError as error:
+            for own in error.problems:
+                place: Place = ("vehicles", entry, "type")
+                yield own if own.file is not None else scenario.problem(place, own.message, given=own.given)
 
 
 def _check_sources(scenario: Scenario, ground: Ground) -> Iterator[Problem]:

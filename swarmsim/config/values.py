@@ -11,6 +11,9 @@ from swarmsim.config.mission import Mission
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.scenario import Scenario, resolve
 
+ORIGIN = "values"
+"""What messages name as the place of such a value."""
+
 
 def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
     """The scenario with ``values`` at dotted paths (``sources.0.activity_mbq``), checked as a whole.
@@ -25,7 +28,7 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         data["definitions"] = copy.deepcopy(own.data["definitions"]) if changed else own.data["definitions"]
     document = Document(data, dict(own.marks), own.files)
     texts = [f"{path}={json.dumps(plain(value))}" for path, value in values.items()]
-    apply_overrides(document, texts, shape_of(Mission))
+    apply_overrides(document, texts, shape_of(Mission), ORIGIN)
     return resolve(document, scenario.mission_file, [], like=scenario)
 
 

@@ -105,7 +105,7 @@ def check_time_step(spec: Multirotor, dt: float) -> None:
     longest = longest_time_step(spec)
     if dt > longest:
         raise InputError.of(
-            f"a time step of {dt} s is too long for the feet of {spec.name}: use {longest:.4f} s or less, "
+            f"a time step of {dt:g} s is too long for the feet of {spec.name}: use {longest:.2g} s or less, "
             "or softer feet (feet.stiffness_n_m, feet.damping_n_s_m)"
         )
 

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmsim.config.radiation import Material
+from swarmsim.config.radiation import CRYSTAL_MAX_KEV, Material
 from swarmsim.radiation.elements import ELECTRON_KEV, ENERGY_RANGE_KEV
 from swarmsim.radiation.interactions import QUANTILES, Interactions, interactions, scattered_fraction
 
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 ENERGIES_KEV = np.array([
     30.0, 36.0, 45.0, 60.0, 80.0, 105.0, 140.0, 190.0, 250.0, 330.0, 430.0, 560.0, 720.0, 930.0, 1200.0, 1550.0, 2000.0,
-    2600.0, 3400.0,
+    2600.0, CRYSTAL_MAX_KEV,
 ])  # fmt: skip
 """Energies of the Monte Carlo; everything between them is interpolated."""
 BELOW, ABOVE = 48, 16

@@ -12,7 +12,7 @@ from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.family import CAN_VARY, canonical, ends_of
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.site_checks import check_site
-from swarmsim.config.values import with_values
+from swarmsim.config.values import ORIGIN, with_values
 from swarmsim.families.draw import Drawer, Draws, with_given
 from swarmsim.missions.knowledge import Conclusion
 from swarmsim.missions.plan import Plan
@@ -172,8 +172,21 @@ class Simulation:
         except InputError as error:
             if not self.scenario.family:
                 raise
-            drawn = [replace(p, message=f"{p.message} (in the mission of seed {seed})") for p in error.problems]
-            raise InputError(drawn) from None
+            raise InputError(self._drawn_so(problem, seed) for problem in error.problems) from None
+
+    def _drawn_so(self, problem: Problem, seed: int) -> Problem:
+        """What is wrong with the mission of a seed; told where the distribution stands that drew it."""
+        told = replace(problem, message=f"{problem.message} (in the mission of seed {seed})")
+        if problem.file != ORIGIN:
+            return told
+        path = f"{problem.path}."
+        for varied in self.scenario.family:
+            if path.startswith(f"{varied.path}.") or f"{varied.path}.".startswith(path):
+                place = ("vary", varied.key, varied.distribution.kind)
+                message = f"draws a value with which the mission is wrong: {told.message}"
+                hints = {"given": told.given, "allowed": told.allowed, "suggestion": told.suggestion}
+                return self.scenario.problem(place, message, **hints)
+        return told
 
     def _spread(self, batch: Batch, draws: Draws, layout: Layout) -> tuple[Spread, Spread]:
         """World and plan of every mission."""

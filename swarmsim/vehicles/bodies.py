@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 import yourdfpy
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.vehicles import BodyFile, Multirotor
@@ -123,7 +124,7 @@ def read_rover_body(source: BodyFile) -> RoverBody:
 def with_file_body(spec: Multirotor) -> Multirotor:
     """``spec`` with the mass and the inertia of its body file; as it is when it names none.
 
-    Raises `InputError` as `read_body` does.
+    Raises `InputError` as `read_body` does, and for a body with which the vehicle could not fly.
     """
     if spec.body is None:
         return spec
@@ -131,7 +132,11 @@ def with_file_body(spec: Multirotor) -> Multirotor:
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = body.inertia_kg_m2.tolist()
     skew = max(map(abs, (xy, xz, yz))) > _ROUNDING * min(xx, yy, zz)
     inertia = (xx, yy, zz, xy, xz, yz) if skew else (xx, yy, zz)
-    return spec.model_copy(update={"mass_kg": body.mass_kg, "inertia_kg_m2": inertia})
+    try:
+        return Multirotor.model_validate(spec.model_dump() | {"mass_kg": body.mass_kg, "inertia_kg_m2": inertia})
+    except ValidationError as error:
+        told = "; ".join(str(each.get("ctx", {}).get("error", each["msg"])) for each in error.errors())
+        raise InputError.of(f"its body does not suit the vehicle '{spec.name}': {told}", file=body.file) from error
 
 
 def _urdf_text(path: Path, args: dict[str, str | float | int | bool]) -> str:

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from swarmsim.config.checks import footprint_radius_m
 from swarmsim.config.errors import InputError
-from swarmsim.config.flight import Failsafe
+from swarmsim.config.flight import Failsafe, FlightEffects
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.vehicles import Multirotor, SkidSteer
 from swarmsim.kept import kept, stored
@@ -230,7 +230,7 @@ def _group(scenario: Scenario, members: tuple[int, ...], timing: Timing, library
     params: dict[int, Any] = {}
     for spec in specs:
         if id(spec) not in params:  # many members share one specification
-            params[id(spec)] = _params(scenario, spec, timing)
+            params[id(spec)] = vehicle_params(spec, scenario.mission.effects, timing.time_step_s)
     params = dict(zip(params, _alike(list(params.values())), strict=True))
     return Group(
         params=_stack([params[id(spec)] for spec in specs]),
@@ -257,11 +257,12 @@ def _alike(params: list[Any]) -> list[Any]:
     return [given(own) for own in params]
 
 
-def _params(scenario: Scenario, spec: Spec, timing: Timing) -> Any:
+def vehicle_params(spec: Spec, effects: FlightEffects, time_step_s: float) -> Any:
+    """Parameters of a vehicle; raises `InputError` for a body's file that is wrong, or a time step that is too long."""
     if isinstance(spec, SkidSteer):
         return skid_steer_params(spec)
-    check_time_step(spec, timing.time_step_s)
-    return multirotor_params(embodied(spec), scenario.mission.effects)
+    check_time_step(spec, time_step_s)
+    return multirotor_params(embodied(spec), effects)
 
 
 def deck_of(spec: Spec, params: Any) -> tuple[float, float, float]:

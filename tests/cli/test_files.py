@@ -38,6 +38,40 @@ def test_check_tells_all_problems_of_all_files(project: Path, capsys: pytest.Cap
         assert fragment in printed.err
 
 
+TORN = {
+    "a detector": ("vehicles/tarot_t650", "model: nai_1p5x1p5", "model: nai_1p5x1", "detector.model", "nai_1p5x1p5"),
+    "a sensor": ("vehicles/x500", "bmi088", "bmi08", "sensors.0", "bmi088"),
+    "a crystal": ("detectors/nai_2x2", "crystal: sodium", "crystal: sodiu", "crystal", "sodium_iodide"),
+    "a housing": ("detectors/nai_2x2", "aluminium", "aluminum", "housing.material", "aluminium"),
+}
+
+
+@pytest.mark.parametrize(("file", "old", "new", "place", "near"), TORN.values(), ids=TORN)
+def test_check_follows_what_a_file_names(
+    project: Path, capsys: pytest.CaptureFixture[str], file: str, old: str, new: str, place: str, near: str
+) -> None:
+    spoil(project / f"configs/{file}.yaml", old, new)
+    assert cli.main(["check", f"configs/{file}.yaml"]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"configs/{file}.yaml:")
+    assert f" {place}: " in printed
+    assert "that does not exist" in printed
+    assert f"did you mean '{near}'?" in printed
+
+
+def test_check_tells_faults_of_what_a_file_names(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    configs = project / "configs"
+    spoil(configs / "materials/aluminium.yaml", "density_kg_m3", "density")
+    assert cli.main(["check", "configs/vehicles/tarot_t650.yaml"]) == 2
+    assert "configs/materials/aluminium.yaml" in capsys.readouterr().err
+    vehicle = configs / "vehicles/orpheus.yaml"
+    vehicle.write_text(vehicle.read_text() + "\nbody: {file: body.urdf}\n")
+    (configs / "vehicles/body.urdf").write_text("<robot name='r'><link name='a'/></robot>")
+    spoil(configs / "materials/aluminium.yaml", "density", "density_kg_m3")
+    assert cli.main(["check", "configs/vehicles/orpheus.yaml"]) == 2
+    assert "body.urdf: the body has no mass" in capsys.readouterr().err
+
+
 def test_check_cannot_tell_the_kind_of_anything(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (project / "x.yaml").write_text("colour: red\n")
     (project / "empty").mkdir()

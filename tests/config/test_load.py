@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from swarmsim.config import files
+from swarmsim.config.bare import bare_scenario
 from swarmsim.config.documents import Mark
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.load import load_all, load_model, load_named, read_document
@@ -13,6 +14,7 @@ from swarmsim.config.mission import Mission, Trigger
 from swarmsim.config.names import did_you_mean, nearest
 from swarmsim.config.policies import ParallelLines, line_spacing
 from swarmsim.config.scenario import load_scenario, scenario_of
+from swarmsim.config.values import with_values
 from swarmsim.config.vehicles import Multirotor, Vehicle
 from tests.config.project import line_of, spoil
 
@@ -158,11 +160,52 @@ def test_an_override_is_told_as_such(mission: Path) -> None:
     assert document.mark(("sources",)) == Mark("configs/missions/recon.yaml", line_of(mission, "sources:"))
 
 
+def test_a_value_given_in_python_is_told_as_such(mission: Path) -> None:
+    scenario = load_scenario("recon")
+    with pytest.raises(InputError, match=r"^values wind\.speed_m_s: is too large"):
+        with_values(scenario, {"wind.speed_m_s": 99})
+    with pytest.raises(InputError, match=r"^values wind\.sped_m_s: wind has no field 'sped_m_s'"):
+        with_values(scenario, {"wind.sped_m_s": 9})
+
+
 def test_an_override_reaches_into_a_vehicle(mission: Path) -> None:
     scenario = load_scenario("recon", ["definitions.vehicles.tarot_t650.mass_kg=4.0"])
     assert scenario.vehicles[0].mass_kg == 4.0
     assert scenario.vehicles[0] == load_named("vehicles", "tarot_t650").model_copy(update={"mass_kg": 4.0})
     assert scenario.vehicles[3] == load_named("vehicles", "orpheus")
+
+
+def test_an_override_reaches_into_a_material(mission: Path) -> None:
+    scenario = load_scenario("recon", ["definitions.materials.concrete.density_kg_m3=1000"])
+    assert scenario.materials["concrete"].density_kg_m3 == 1000
+    assert scenario.materials["brick"] == load_named("materials", "brick")
+    assert "density_kg_m3: 1000" in scenario.to_yaml()
+
+
+def test_an_override_leaves_a_body_beside_its_vehicle(mission: Path) -> None:
+    vehicles = mission.parents[1] / "vehicles"
+    (vehicles / "body.urdf").write_text("<robot name='r'/>")
+    orpheus = vehicles / "orpheus.yaml"
+    orpheus.write_text(orpheus.read_text() + "\nbody: {file: body.urdf}\n")
+    scenario = load_scenario("recon", ["definitions.vehicles.orpheus.mass_kg=60"])
+    assert scenario.vehicles[3].body is not None
+    assert Path(scenario.vehicles[3].body.file) == vehicles / "body.urdf"
+
+
+def test_what_an_autopilot_flies_keeps_the_materials_of_the_mission(mission: Path) -> None:
+    site = mission.parents[1] / "sites" / "works_yard" / "site.yaml"
+    site.write_text(site.read_text() + "ground_material: mud\n")
+    mud = "{name: mud, density_kg_m3: 1500, composition: {O: 0.5, Si: 0.5}, source: made up for the test}"
+    whole = load_scenario("recon", [f"definitions.materials={{mud: {mud}}}"])
+    assert bare_scenario(whole, [0], "bare", whole.mission.timing).site.ground_material == "mud"
+
+
+def test_a_library_without_air_is_told(mission: Path) -> None:
+    written = mission.with_name("written.yaml")
+    written.write_text(load_scenario("recon").to_yaml(), encoding="utf-8")
+    spoil(written, "    air:\n      name: air\n", "    gas:\n      name: gas\n")
+    with pytest.raises(InputError, match="what lies between obstacles is of a material 'air' that does not exist"):
+        load_scenario(written)
 
 
 def test_the_area_is_turned_counter_clockwise(mission: Path) -> None:

@@ -191,6 +191,33 @@ OVERRIDES = {
         "definitions.vehicles.x600.mass_kg=1",
         ["there is no vehicle 'x600'", "did you mean 'x500'"],
     ),
+    "unknown material": (
+        "definitions.materials.concret.density_kg_m3=2000",
+        [
+            "--set definitions.materials.concret.density_kg_m3: there is no material 'concret'",
+            "did you mean 'concrete'",
+        ],
+    ),
+    "bad material": (
+        "definitions.materials.concrete.density_kg_m3=-1",
+        ["--set definitions.materials.concrete.density_kg_m3: is too small"],
+    ),
+    "definition with a path": (
+        "definitions.vehicles./etc/passwd.mass_kg=1",
+        ["--set definitions.vehicles./etc/passwd.mass_kg: there is no vehicle '/etc/passwd'"],
+    ),
+    "definition of what the team has not": (
+        "definitions.vehicles.husky.mass_kg=60",
+        ["--set definitions.vehicles.husky.mass_kg: changes nothing: the mission has no vehicle 'husky'", "tarot_t650"],
+    ),
+    "judged too seldom": (
+        "timing.judge_period_s=0.2",
+        ["--set timing.judge_period_s: is longer than the sample_period_s of the detector 'nai", "at most 0.1"],
+    ),
+    "line beyond crystals": (
+        "definitions.nuclides.Co-60.lines=[{energy_kev: 6129, yield_percent: 67}]",
+        ["--set definitions.nuclides.Co-60.lines.0.energy_kev: lies beyond the response", "at most 3400"],
+    ),
     "landing that is a crash": (
         "definitions.vehicles.tarot_t650.impact_speed_max_m_s=0.3",
         ["phases.0.settings.touchdown_speed_m_s: is a crash for the vehicle type 'tarot_t650'", "at most 0.3"],
@@ -230,6 +257,7 @@ def test_a_file_that_is_no_mission(mission: Path, content: bytes, fragments: lis
 @pytest.mark.parametrize(("override", "fragments"), OVERRIDES.values(), ids=OVERRIDES)
 def test_an_override_that_spoils_the_mission(mission: Path, override: str, fragments: list[str]) -> None:
     message = message_of(mission, override)
+    assert "this field is missing" not in message  # of a definition that is not there nothing else is told
     for fragment in fragments:
         assert fragment in message
 
@@ -325,9 +353,15 @@ ROTORS = {
     "on one line": (["0.1, 0.2", "0.2, 0.4", "0.3, 0.6", "0.4, 0.8"], "stand on one line seen from above"),
     "at one point": (["0.1, 0.2"] * 4, "stand at one point seen from above"),
     "in the middle": (["0.0, 0.0"] * 4, "stand at one point seen from above"),
-    "of one sense on each side": (["0.2, 0.2", "0.2, -0.2", "-0.2, 0.2", "-0.2, -0.2"], "neighbours that turn opposite"),
+    "of one sense on each side": (
+        ["0.2, 0.2", "0.2, -0.2", "-0.2, 0.2", "-0.2, -0.2"],
+        "neighbours that turn opposite",
+    ),
     "three": (["0.2, 0.2", "0.2, -0.2", "-0.2, 0.0"], "it takes four or more"),
-    "in front": (["1.2, 0.2", "0.8, 0.2", "1.2, -0.2", "0.8, -0.2"], "cannot hold the vehicle level: it takes thrusts of"),
+    "in front": (
+        ["1.2, 0.2", "0.8, 0.2", "1.2, -0.2", "0.8, -0.2"],
+        "cannot hold the vehicle level: it takes thrusts of",
+    ),
 }
 
 

@@ -82,6 +82,10 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
         ("vehicles.orpheus.position_m=[-75, 0]", "vehicles.3.position_m", ["'orpheus' starts where a rover cannot"]),
         (f"{SURVEY}.area_m=[[0, 0], [200, 0], [0, 60]]", f"{FIRST}.area_m", ["reaches beyond the site", "[200, 0]"]),
         (f"{SURVEY}.area_m=[[0, 0], [5, 0], [5, 60], [0, 60]]", f"{FIRST}.area_m", ["no room for one", "10 m"]),
+        (
+            "definitions.vehicles.tarot_t650.feet.stiffness_n_m=1e9", "vehicles.0.type",
+            ["a time step of 0.005 s is too long for the feet of tarot_t650"],
+        ),
         ("mapping.cell_m=0.05", "mapping.cell_m", ["a map of 2800 x 2400 cells", "at most 250000", "larger cell_m"]),
         ("mapping.length_scale_m=0.01", "mapping.length_scale_m", ["too short", "at most 1024", "given:   0.01"]),
         (f"{SURVEY}.line_spacing_m=130", FIRST, ["no room for one survey line", "smaller line_spacing_m"]),
@@ -185,3 +189,15 @@ def test_a_way_over_a_thing_that_reaches_to_the_ceiling(
     assert given in "".join(str(problem) for problem in problems if problem.path == path)
     assert check_site(load_scenario(mission, [override, "failsafes.fence.ceiling_m=25"]), high) == []
     assert check_site(load_scenario(mission, [override, "failsafes.fence={ceiling_m: 22, action: none}"]), high) == []
+
+
+def test_a_vehicle_whose_body_cannot_be_read(mission: Path, site: SiteModel) -> None:
+    vehicles = mission.parents[1] / "vehicles"
+    (vehicles / "body.urdf").write_text("<robot name='r'><link name='a'/></robot>")
+    for name in ("orpheus", "tarot_t650"):
+        vehicle = vehicles / f"{name}.yaml"
+        vehicle.write_text(vehicle.read_text() + "\nbody: {file: body.urdf}\n")
+    problems = check_site(load_scenario(mission), site)
+    assert [(Path(problem.file or "").name, problem.message[:21]) for problem in problems] == [
+        ("body.urdf", "the body has no mass:")
+    ] * 2
