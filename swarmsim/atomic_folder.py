@@ -52,6 +52,8 @@ def claimed(target: Path) -> Iterator[Path]:
     died are removed. Raises `InputError` where another process, or another thread, has claimed ``target``. Missing
     parents of ``target`` are created, and removed again when the block ends with an exception.
     """
+    if "\0" in str(target):
+        raise InputError.of("no folder can have a name with a null character", given=str(target))
     target = target.absolute()
     thread, held = _held.get(target, (None, None))
     if held is not None and thread == threading.get_ident():

@@ -73,6 +73,17 @@ def dotted(place: Place) -> str:
     return ".".join(map(str, place))
 
 
+def other_key(value: Any, place: tuple[Any, ...] = ()) -> tuple[Any, ...] | None:
+    """Place of a field in ``value`` whose name is no text, with that name at its end; None where all are."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else ()
+    for key, inner in items:
+        if isinstance(value, dict) and not isinstance(key, str):
+            return (*place, key)
+        if (found := other_key(inner, (*place, key))) is not None:
+            return found
+    return None
+
+
 class _Loader(yaml.SafeLoader):
     """Composes nodes with the scalars of the YAML 1.2 core schema; its errors are the ones that users are told."""
 

@@ -81,6 +81,10 @@ def file_errors_told(sentence: str, **where: Any) -> Iterator[None]:
     """Turn an error of the file system, such as a full disk, into an `InputError`; ``where`` as in `InputError.of`."""
     try:
         yield
+    except ValueError as error:
+        if "null byte" not in str(error):
+            raise
+        raise InputError.of(f"{sentence} (its name holds a null character)", **where) from error
     except OSError as error:
         raise InputError.of(f"{sentence} ({error.strerror or error})", **where) from error
 

@@ -7,6 +7,7 @@ from swarmsim.config.errors import InputError
 from swarmsim.config.names import did_you_mean, one_of
 
 KINDS = ("vehicles", "sites", "missions", "detectors", "sensors", "nuclides", "materials")
+SHOWN = 60  # characters of what is no name
 _SUFFIXES = (".yaml", ".yml")
 
 
@@ -86,8 +87,11 @@ def find(kind: str, name: str | Path, near: Path | None = None) -> Path:
 
     Raises `InputError` with the nearest names when there is none.
     """
+    if not isinstance(name, str | os.PathLike):
+        what, allowed = kind.removesuffix("s"), "a text or a pathlib.Path"
+        raise InputError.of(f"a {what} is named by a text or a path", given=repr(name)[:SHOWN], allowed=allowed)
     path = Path(name)
-    if isinstance(name, Path) or looks_like_path(name):
+    if not isinstance(name, str) or looks_like_path(name):
         if kind == "sites" and is_file(path / "site.yaml"):
             return path / "site.yaml"
         if exists(path):

@@ -15,6 +15,7 @@ from swarmsim.config.vehicles import Vehicle
 
 TEAM_MAX = 2000  # vehicles of a mission, formations expanded
 PHASES_MAX = 64
+SEED_END = 2**31
 
 
 class Timing(Model):
@@ -269,7 +270,7 @@ class Mission(Model):
     name: Name
     description: str = ""
     site: Name
-    seed: int = Field(default=0, ge=0, lt=2**31)
+    seed: int = Field(default=0, ge=0, lt=SEED_END)
     engine: Literal["mjx", "analytic"] = "mjx"
     detection: Literal["physical", "paper_ideal"] = "physical"
     timing: Timing = Timing()

@@ -1,7 +1,7 @@
 """A scenario: a mission with everything that it names looked up, checked and held together."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.checks import check_consistency, check_team_size
 from swarmsim.config.definitions import bring_in_definitions, unused_definitions
-from swarmsim.config.documents import Document, Place, dump_yaml
+from swarmsim.config.documents import Document, Place, dotted, dump_yaml, other_key
 from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.family import Varied, add_sources, read_family, set_and_varied, varied_paths
 from swarmsim.config.load import load_named, read_document
@@ -114,7 +114,7 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
     """
     path = files.find("missions", name_or_path)
     document = read_document(path, "missions")
-    overrides = (*overrides, f"seed={seed}") if seed is not None else tuple(overrides)
+    overrides = (*_texts(overrides), f"seed={seed}") if seed is not None else _texts(overrides)
     problems = bring_in_definitions(document, overrides, path, partial(Problem, file=ORIGIN))
     unknown = {problem.path for problem in problems}
     known = [text for text in overrides if text.partition("=")[0].strip() not in unknown]
@@ -137,7 +137,25 @@ def scenario_of(mission: Mission, near: Path | None = None) -> Scenario:
 
     ``near`` is a file beside whose ``configs`` names are looked up, and in whose folder files of policies are.
     """
-    return resolve(Document(mission.model_dump(mode="json", exclude_none=True)), near, [])
+    if not isinstance(mission, Mission):
+        hint = "swarmsim.load takes a name or a file; of a mapping make swarmsim.config.mission.Mission(**mapping)"
+        raise InputError.of("is no mission", given=repr(mission)[: files.SHOWN], suggestion=hint)
+    # A model that was changed without being validated may hold anything: it is told below, and not warned of here.
+    if other := other_key(mission.model_dump(warnings=False)):
+        path, key = dotted(other[:-1]) or None, repr(other[-1])[: files.SHOWN]
+        raise InputError.of("a field's name must be a text", path=path, given=key)
+    return resolve(Document(mission.model_dump(mode="json", exclude_none=True, warnings=False)), near, [])
+
+
+def _texts(overrides: Any) -> tuple[str, ...]:
+    """The overrides, each a text; raises `InputError` for anything else."""
+    given = (overrides,) if isinstance(overrides, str | bytes) or not isinstance(overrides, Iterable) else overrides
+    texts = tuple(given)
+    for text in texts:
+        if given is not overrides or not isinstance(text, str):
+            allowed = 'a list of texts path=value, such as ["wind.speed_m_s=3"]'
+            raise InputError.of("are no overrides", given=repr(overrides)[: files.SHOWN], allowed=allowed)
+    return texts
 
 
 def resolve(document: Document, near: Path | None, problems: list[Problem], like: "Scenario | None" = None) -> Scenario:

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from swarmsim.config.allowed import shape_of
-from swarmsim.config.documents import Document
+from swarmsim.config.documents import Document, other_key
+from swarmsim.config.errors import InputError
+from swarmsim.config.files import SHOWN
 from swarmsim.config.mission import Mission
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.scenario import Scenario, resolve
@@ -27,9 +29,31 @@ def with_values(scenario: Scenario, values: Mapping[str, Any]) -> Scenario:
         changed = any(path.startswith("definitions") for path in values)
         data["definitions"] = copy.deepcopy(own.data["definitions"]) if changed else own.data["definitions"]
     document = Document(data, dict(own.marks), own.files)
-    texts = [f"{path}={json.dumps(plain(value))}" for path, value in values.items()]
+    texts = [f"{path}={_text(path, value)}" for path, value in values.items()]
     apply_overrides(document, texts, shape_of(Mission), ORIGIN)
     return resolve(document, scenario.mission_file, [], like=scenario)
+
+
+def _text(path: str, value: Any) -> str:
+    """A value as it is written in an override; raises `InputError` for what no configuration can hold."""
+    try:
+        text = json.dumps(value, default=_array)
+        other = other_key(value)
+    except (TypeError, ValueError, RecursionError):
+        other, text = (value,), ""
+    if other is None:
+        return text
+    allowed = "numbers, texts, true and false, lists and arrays, and mappings whose keys are texts"
+    raise InputError.of(
+        "is no value of a configuration", file=ORIGIN, path=str(path), given=repr(value)[:SHOWN], allowed=allowed
+    )
+
+
+def _array(value: Any) -> Any:
+    found = plain(value)
+    if found is value:
+        raise TypeError
+    return found
 
 
 def plain(value: Any) -> Any:

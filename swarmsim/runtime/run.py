@@ -1,11 +1,14 @@
 """Fly a scenario and leave a run behind: what ``swarmsim run`` does, and what scripts call."""
 
+import os
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
+from numbers import Integral
 from pathlib import Path
 
 from swarmsim.atomic_folder import claimed
-from swarmsim.config.errors import raise_if_any
+from swarmsim.config.errors import InputError, raise_if_any
+from swarmsim.config.files import SHOWN
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.site_checks import check_site
 from swarmsim.results.extract import mission_record
@@ -23,6 +26,9 @@ def build(scenario: Scenario) -> Simulation:
     No setting of the process is changed (see `swarmsim.use_all_cores`). Raises `InputError` with everything that is
     wrong.
     """
+    if not isinstance(scenario, Scenario):
+        hint = "load it first: swarmsim.build(swarmsim.load('recon'))"
+        raise InputError.of("is no scenario", given=repr(scenario)[:SHOWN], suggestion=hint)
     site_model = load_site(
         scenario.site_file, tuple(scenario.materials), [m.density_kg_m3 for m in scenario.materials.values()]
     )
@@ -41,6 +47,10 @@ def run(
     another run is being written there, and where there is too little room on the disk. When writing fails after the
     flight, the results are kept in a temporary place, which the error tells.
     """
+    if not isinstance(out, str | os.PathLike):
+        raise InputError.of("the folder of a run is named by a text or a path", path="out", given=repr(out)[:SHOWN])
+    if not isinstance(missions, Integral) or isinstance(missions, bool) or missions < 1:
+        raise InputError.of("a run has one mission or more", path="missions", given=repr(missions)[:SHOWN])
     out = Path(out)
     check_out(out, force)
     check_space(out)

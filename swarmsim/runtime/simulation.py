@@ -10,6 +10,8 @@ import numpy as np
 from swarmsim import randomness
 from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.family import CAN_VARY, canonical, ends_of
+from swarmsim.config.files import SHOWN
+from swarmsim.config.mission import SEED_END
 from swarmsim.config.scenario import Scenario
 from swarmsim.config.site_checks import check_site
 from swarmsim.config.values import ORIGIN, with_values
@@ -76,7 +78,7 @@ class Simulation:
 
     def draw(self, seeds: int | Sequence[int] | np.ndarray) -> Draws:
         """What the missions ``seeds`` of a family draw; ``values`` of it can be changed and given to `rollout`."""
-        return self._drawer.draw(np.atleast_1d(np.asarray(seeds, np.int64)))
+        return self._drawer.draw(_numbers(seeds))
 
     def world_of(self, seed: int) -> World:
         """The world of the mission ``seed`` of a family, to be stepped by hand; of the shapes of ``world``."""
@@ -120,7 +122,7 @@ class Simulation:
             InputError: a path or a value is wrong, or changes more than values (a count, a policy, a period).
         """
         tell = progress or SilentProgress()
-        numbers = np.atleast_1d(np.asarray(seeds, np.int64))
+        numbers = _numbers(seeds)
         padded = filled(numbers)
         batch = self._batches.setdefault(len(padded), Batch(len(padded), self.clock))
         self.clock.reset()
@@ -150,10 +152,15 @@ class Simulation:
     def _given(self, draws: Draws, values: Mapping[str, Sequence[Any]]) -> Draws:
         """The draws with ``values`` in their stead."""
         missions = len(draws.seeds)
+        if not isinstance(values, Mapping):
+            allowed = 'a value for each mission by path: {"wind.speed_m_s": [1.0, 2.0]}'
+            raise InputError.of("are no values", path="values", given=repr(values)[:SHOWN], allowed=allowed)
         for path, each in values.items():
-            if len(each) != missions:
+            single = isinstance(each, str | bytes | Mapping) or np.ndim(np.asarray(each, object)) == 0
+            if single or len(each) != missions:
+                given = repr(each)[:SHOWN] if single else f"{len(each)} values"
                 raise InputError.of(
-                    "needs a value for each mission", path=path, given=f"{len(each)} values", allowed=str(missions)
+                    "needs a value for each mission", path=str(path), given=given, allowed=f"a list of {missions}"
                 )
         scenario = self.scenario
         named = {canonical(scenario.document, path, scenario.mission_file): each for path, each in values.items()}
@@ -216,6 +223,19 @@ class Simulation:
                     path=", ".join(values),
                     suggestion="roll out a simulation of its own for each",
                 )
+
+
+def _numbers(seeds: Any) -> np.ndarray:
+    """Seeds [B] as int64; raises `InputError` for what are none."""
+    try:
+        numbers = np.atleast_1d(np.asarray(seeds))
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    whole = np.issubdtype(numbers.dtype, np.integer) and numbers.ndim == 1 and numbers.size > 0
+    if not whole or numbers.min() < 0 or numbers.max() >= SEED_END:
+        allowed = f"a whole number from 0 to {SEED_END - 1}, or a list of at least one"
+        raise InputError.of("are no seeds", path="seeds", given=repr(seeds)[:SHOWN], allowed=allowed)
+    return numbers.astype(np.int64)
 
 
 def _built(scenario: Scenario, site_model: SiteModel) -> tuple[World, Plan]:

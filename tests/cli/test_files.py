@@ -212,6 +212,16 @@ def test_import_site_of_a_missing_file(project: Path, capsys: pytest.CaptureFixt
     assert everything(project) == before
 
 
+@pytest.mark.parametrize("command", [["init", "a\0b"], ["replay-log", "a\0b.tlog"], ["check", "a\0b/c.yaml"]])
+def test_a_null_character_in_a_name_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(command) == 2
+    assert "a\\x00b" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_name_that_no_file_can_have_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

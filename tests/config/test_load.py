@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from swarmsim.config import files
@@ -259,3 +261,43 @@ def test_every_broken_file_of_a_kind_is_told(mission: Path) -> None:
     with pytest.raises(InputError) as caught:
         load_all("nuclides")
     assert {Path(p.file).stem for p in caught.value.problems if p.file} == {"Co-60", "Cs-137"}
+
+
+@pytest.mark.parametrize("name", [None, 3, b"recon", ["recon"], object()])
+def test_what_cannot_name_a_mission(mission: Path, name: Any) -> None:
+    with pytest.raises(InputError, match="a mission is named by a text or a path"):
+        load_scenario(name)
+
+
+@pytest.mark.parametrize("overrides", [None, 3, "seed=3", b"seed=3", [b"seed=3"], [3], ["seed=3", None]])
+def test_what_are_no_overrides(mission: Path, overrides: Any) -> None:
+    with pytest.raises(InputError, match="are no overrides"):
+        load_scenario("recon", overrides)
+
+
+CIRCLE: list[Any] = []
+CIRCLE.append(CIRCLE)
+
+
+@pytest.mark.parametrize(
+    "value", [{None: 1}, {"uniform": {1: 2}}, [{(1, 2): 3}], b"x", {1, 2}, 1j, object(), Path("x"), CIRCLE]
+)
+def test_what_is_no_value(mission: Path, value: Any) -> None:
+    with pytest.raises(InputError, match=r"^values sources: is no value of a configuration"):
+        with_values(load_scenario("recon"), {"sources": value})
+
+
+def test_arrays_within_a_value_are_lists(mission: Path) -> None:
+    value = [np.float32(1.0), np.array(2.0)]
+    assert with_values(load_scenario("recon"), {"sources.0.position_m": value}).mission.sources[0].position_m == (1, 2)
+
+
+def test_what_is_no_mission(mission: Path) -> None:
+    for given in (None, {"name": "x"}, "recon"):
+        with pytest.raises(InputError, match="is no mission"):
+            scenario_of(given)  # type: ignore[arg-type]
+    made = load_model(mission, Mission)
+    with pytest.raises(InputError, match="versions: a field's name must be a text"):
+        scenario_of(made.model_copy(update={"versions": {None: "1.0"}}))
+    with pytest.raises(InputError, match="sources: is not a list"):
+        scenario_of(made.model_copy(update={"sources": {"x": 1}}))

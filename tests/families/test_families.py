@@ -233,6 +233,19 @@ def test_given_values_come_before_drawn_ones(standing):
     )
 
 
+def test_what_are_no_seeds_or_no_values_for_them(standing):
+    for seeds in ([], -1, [0, 2**31], 1.5, "x", None, [[0, 1]]):
+        with pytest.raises(swarmsim.InputError, match="are no seeds"):
+            standing.draw(seeds)
+        with pytest.raises(swarmsim.InputError, match="are no seeds"):
+            standing.rollout(seeds)
+    for value in (3.0, np.array(3.0), "12", [1.0, 2.0, 3.0]):
+        with pytest.raises(swarmsim.InputError, match=r"wind\.speed_m_s: needs a value for each mission"):
+            standing.rollout([3, 4], values={"wind.speed_m_s": value})
+    with pytest.raises(swarmsim.InputError, match="are no values"):
+        standing.rollout([3, 4], values=[1.0, 2.0])
+
+
 def test_values_in_the_stead_of_a_family_make_a_single_scenario(standing):
     row = {path: value for path, (value,) in standing.draw(5).values.items()}
     alone = with_values(standing.scenario, row)

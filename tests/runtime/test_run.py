@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import pytest
@@ -22,6 +23,22 @@ def test_build_changes_no_setting_of_the_process() -> None:
 def test_build_refuses_what_does_not_fit_the_site() -> None:
     with pytest.raises(swarmsim.InputError, match="sources"):
         swarmsim.build(swarmsim.load("recon", ["sources.0.position_m=[900, 0]"]))
+
+
+def test_what_cannot_be_built_or_run(tmp_path: Path) -> None:
+    for given in (None, "recon"):
+        with pytest.raises(swarmsim.InputError, match="is no scenario"):
+            swarmsim.build(given)  # type: ignore[arg-type]
+    scenario = swarmsim.load("recon", ["engine=analytic"])
+    for missions in (0, -1, 1.5, True):
+        with pytest.raises(swarmsim.InputError, match="a run has one mission or more"):
+            swarmsim.run(scenario, tmp_path / "run", missions)  # type: ignore[arg-type]
+    for out in (None, b"run", 3):
+        with pytest.raises(swarmsim.InputError, match="named by a text or a path"):
+            swarmsim.run(scenario, out)  # type: ignore[arg-type]
+    with pytest.raises(swarmsim.InputError, match="a null character"):
+        swarmsim.run(scenario, f"{tmp_path}/a\0b")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("chosen", [None, 3])
