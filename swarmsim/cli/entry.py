@@ -15,7 +15,7 @@ from typing import Any
 from cyclopts import CycloptsError
 
 from swarmsim.cli.commands import app
-from swarmsim.config.errors import InputError
+from swarmsim.config.errors import InputError, stop_of
 
 _AGAIN_S = 0.05  # after which what swallowed Ctrl-C has ended
 EXIT_INPUT, EXIT_HUNG_UP, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 129, 130, 143
@@ -56,12 +56,6 @@ def _unraisable(found: Any) -> None:
     again = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), number))
     again.daemon = True
     again.start()
-
-
-def _stop_of(error: BaseException) -> KeyboardInterrupt | None:
-    """The Ctrl-C that an error stands for: Python 3.11 wraps one that meets a class being made."""
-    stop = error if isinstance(error, KeyboardInterrupt) else error.__cause__
-    return stop if isinstance(stop, KeyboardInterrupt) else None
 
 
 def _told(text: str) -> None:
@@ -109,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _told(f"no file can have so long a name: '{name[:60]}...' ({len(name)} characters)\n")
         return EXIT_INPUT
     except (KeyboardInterrupt, RuntimeError) as error:
-        stop = _stop_of(error)
+        stop = stop_of(error)
         if stop is None:
             raise
         code, by = EXIT_INTERRUPTED, "with Ctrl-C"

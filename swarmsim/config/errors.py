@@ -89,6 +89,12 @@ def file_errors_told(sentence: str, **where: Any) -> Iterator[None]:
         raise InputError.of(f"{sentence} ({error.strerror or error})", **where) from error
 
 
+def stop_of(error: BaseException) -> KeyboardInterrupt | None:
+    """The Ctrl-C that an error stands for: Python 3.11 wraps one that meets a class being made."""
+    stop = error if isinstance(error, KeyboardInterrupt) else error.__cause__
+    return stop if isinstance(stop, KeyboardInterrupt) else None
+
+
 def raise_if_any(problems: Sequence[Problem]) -> None:
     """Raise one `InputError` with all ``problems``, or nothing when there are none."""
     if problems:

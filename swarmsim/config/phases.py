@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 from swarmsim.config.allowed import item
 from swarmsim.config.documents import Document, Place, dotted
-from swarmsim.config.errors import InputError, Problem
+from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.mission import PHASES_MAX, Trigger
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.policies import LandOn, Orbit, ParallelLines, PolicySettings, Waypoints
 from swarmsim.config.validation import validate
-from swarmsim.config.vehicles import Multirotor, SkidSteer
+from swarmsim.config.vehicles import VEHICLE_KINDS, Multirotor, SkidSteer
 
 if TYPE_CHECKING:
     from swarmsim.config.scenario import Scenario
+    from swarmsim.policies.answers import Answers
 
 ESTIMATES = {"source": ("mapping", "localisation"), "hotspot": ("mapping",)}
 """Sections of a mission that an estimate comes from."""
@@ -73,13 +74,27 @@ def _settings_of(
     marks = {p[len(place) :]: mark for p, mark in document.marks.items() if p[: len(place)] == place}
     around = document.mark(place)
     part = Document(dict(given or {}), marks if around is None else {(): around} | marks)
+    from swarmsim.policies.answers import ask
+
+    prefix = dotted(place)
+    told: list[Problem] = []
     try:
-        found: PolicySettings = validate(part, model)
+        found = ask(policy, "a validator of the settings", partial(_validated, part, model, told))
     except InputError as error:
-        prefix = dotted(place)
-        raise InputError(
-            dataclasses.replace(p, path=f"{prefix}.{p.path}" if p.path else prefix) for p in error.problems
-        ) from None
+        raise InputError(document.problem(place, p.message, suggestion=p.suggestion) for p in error.problems) from None
+    raise_if_any([dataclasses.replace(p, path=f"{prefix}.{p.path}" if p.path else prefix) for p in told])
+    return found
+
+
+def _validated(part: Document, model: type[PolicySettings], told: list[Problem]) -> PolicySettings | None:
+    """The settings; None where they are wrong, with what is ``told`` of them."""
+    try:
+        found = validate(part, model)
+    except InputError as error:
+        told += error.problems
+        return None
+    if not isinstance(found, model):
+        raise TypeError(f"a validator of {model.__name__} must return the settings, not {found!r}"[:200])
     return found
 
 
@@ -89,13 +104,43 @@ def check_phases(scenario: Scenario) -> Iterator[Problem]:
     yield from _check_order(scenario)
     for i in range(len(scenario.mission.phases)):
         yield from _check_who(scenario, i)
-        yield from _check_kinds(scenario, i)
-        yield from _check_senses(scenario, i)
-        yield from _check_partners(scenario, i)
+        try:
+            asked = _asked(scenario, i)
+        except InputError as error:
+            for told in error.problems:
+                details = {"given": told.given, "allowed": told.allowed, "suggestion": told.suggestion}
+                yield scenario.problem(("phases", i, "policy"), told.message, **details)
+            continue
+        yield from _check_kinds(scenario, i, asked)
+        yield from _check_senses(scenario, i, asked)
+        yield from _check_partners(scenario, i, asked)
         yield from _check_landing(scenario, i)
-        yield from _check_needs(scenario, i)
+        yield from _check_needs(scenario, i, asked)
         yield from _check_speeds(scenario, i)
         yield from _check_height(scenario, i)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Asked:
+    """What the policy of a phase says of itself, and its settings of the phase."""
+
+    kinds: tuple[str, ...]  # of vehicle that it can command
+    senses: tuple[str, ...]  # kinds of sensor that it reads
+    answers: Answers
+
+
+def _asked(scenario: Scenario, i: int) -> _Asked:
+    """Raises `InputError` where the policy's code fails, or answers with what is none."""
+    from swarmsim.policies import registry
+    from swarmsim.policies.answers import answers_of
+
+    policy, near = scenario.mission.phases[i].policy, scenario.mission_file
+    kinds = frozenset(scenario.vehicles[k].kind for k in scenario.phase_members[i])
+    return _Asked(
+        kinds=registry.vehicle_kinds(policy, near),
+        senses=registry.senses(policy, near),
+        answers=answers_of(scenario.settings[i], policy, kinds, VEHICLE_KINDS),
+    )
 
 
 def _check_names(scenario: Scenario) -> Iterator[Problem]:
@@ -176,11 +221,9 @@ def _check_who(scenario: Scenario, i: int) -> Iterator[Problem]:
             yield scenario.problem(("phases", i, "who"), message, allowed=allowed, suggestion=did_you_mean(name, known))
 
 
-def _check_kinds(scenario: Scenario, i: int) -> Iterator[Problem]:
-    from swarmsim.policies import registry
-
+def _check_kinds(scenario: Scenario, i: int, asked: _Asked) -> Iterator[Problem]:
     phase, told = scenario.mission.phases[i], set()
-    suited = registry.vehicle_kinds(phase.policy, scenario.mission_file)
+    suited = asked.kinds
     for k in scenario.phase_members[i]:
         vehicle, member = scenario.vehicles[k], scenario.members[k]
         if vehicle.kind not in suited and member.type not in told:
@@ -191,21 +234,17 @@ def _check_kinds(scenario: Scenario, i: int) -> Iterator[Problem]:
                 given=", ".join(phase.who[:NAMES_SHOWN]),
                 allowed=f"vehicles of the kind {' or '.join(suited)}",
             )
-    kinds = frozenset(scenario.vehicles[k].kind for k in scenario.phase_members[i])
-    for field, message in scenario.settings[i].faults(kinds):
+    for field, message in asked.answers.faults:
         yield scenario.problem(("phases", i, "settings", field), message)
 
 
-def _check_senses(scenario: Scenario, i: int) -> Iterator[Problem]:
+def _check_senses(scenario: Scenario, i: int, asked: _Asked) -> Iterator[Problem]:
     """Sensors that a policy reads and a vehicle of the phase lacks."""
-    from swarmsim.policies import registry
-
     phase, told = scenario.mission.phases[i], set()
-    needed = registry.senses(phase.policy, scenario.mission_file)
     for k in scenario.phase_members[i]:
         vehicle, type_name = scenario.vehicles[k], scenario.members[k].type
         carried = {scenario.sensors[name].kind for name in vehicle.sensors}
-        lacking = [kind for kind in needed if kind not in carried]
+        lacking = [kind for kind in asked.senses if kind not in carried]
         if lacking and type_name not in told:
             told.add(type_name)
             reads = f"the policy '{phase.policy}' reads {', '.join(lacking)}"
@@ -216,11 +255,11 @@ def _check_senses(scenario: Scenario, i: int) -> Iterator[Problem]:
             )
 
 
-def _check_partners(scenario: Scenario, i: int) -> Iterator[Problem]:
+def _check_partners(scenario: Scenario, i: int, asked: _Asked) -> Iterator[Problem]:
     """Members of the team that settings name."""
     settings = scenario.settings[i]
     kinds = {member.name: vehicle.kind for member, vehicle in zip(scenario.members, scenario.vehicles, strict=True)}
-    for field, kind in settings.partners.items():
+    for field, kind in asked.answers.partners.items():
         name = getattr(settings, field)
         if kinds.get(name) == kind:
             continue
@@ -254,12 +293,11 @@ def _check_landing(scenario: Scenario, i: int) -> Iterator[Problem]:
             )
 
 
-def _check_needs(scenario: Scenario, i: int) -> Iterator[Problem]:
+def _check_needs(scenario: Scenario, i: int, asked: _Asked) -> Iterator[Problem]:
     mission, phase = scenario.mission, scenario.mission.phases[i]
     senses = any(vehicle.detector is not None for vehicle in scenario.vehicles)
     needs: list[tuple[Place, str, str]] = [
-        (("phases", i, "policy"), f"the policy '{phase.policy}' needs the {need}", need)
-        for need in scenario.settings[i].needed()
+        (("phases", i, "policy"), f"the policy '{phase.policy}' needs the {need}", need) for need in asked.answers.needs
     ]
     for what, trigger in (("start", phase.start), ("end", phase.end)):
         if trigger is not None and trigger.when is not None:
@@ -271,10 +309,10 @@ def _check_needs(scenario: Scenario, i: int) -> Iterator[Problem]:
             yield scenario.problem(place, text, suggestion=f"add {' and '.join(missing)} to the mission")
         elif not senses:
             yield scenario.problem(place, f"{message}, and no vehicle of the team carries a detector to find it")
-    if scenario.settings[i].needed() and phase.start.at_s == 0 and phase.start.delay_s == 0:
+    if asked.answers.needs and phase.start.at_s == 0 and phase.start.delay_s == 0:
         yield scenario.problem(
             ("phases", i, "start"),
-            f"the policy '{phase.policy}' needs the {' and the '.join(scenario.settings[i].needed())}, "
+            f"the policy '{phase.policy}' needs the {' and the '.join(asked.answers.needs)}, "
             "and nothing has been measured when the mission begins",
             suggestion="start it later: start: {after: …}, start: {when: hotspot} or start: {at_s: …}",
         )

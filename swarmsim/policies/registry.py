@@ -14,6 +14,7 @@ import pkgutil
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -22,10 +23,12 @@ from typing import Any, TypeVar
 
 from swarmsim.config import files
 from swarmsim.config.documents import shown_path
-from swarmsim.config.errors import InputError
+from swarmsim.config.errors import InputError, stop_of
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.policies import SETTINGS, PolicySettings
 from swarmsim.config.sensors import SENSOR_KINDS
+from swarmsim.config.vehicles import VEHICLE_KINDS
+from swarmsim.policies.answers import ask, check_attributes, names_of
 
 Policy = TypeVar("Policy")
 ENTRY_POINTS = "swarmsim.policies"
@@ -101,7 +104,8 @@ def settings_model(reference: str, near: Path | None = None) -> type[PolicySetti
     """The model of a policy's settings; `PolicySettings` itself for a policy that has none. Raises as `find` does."""
     if _is_shipped(reference):
         return SETTINGS[reference]
-    model = getattr(find(reference, near), "Settings", None)
+    policy = find(reference, near)
+    model = ask(reference, "Settings", lambda: getattr(policy, "Settings", None))
     if model is None:
         return PolicySettings
     if not (inspect.isclass(model) and issubclass(model, PolicySettings)):
@@ -118,18 +122,12 @@ def vehicle_kinds(reference: str, near: Path | None = None) -> tuple[str, ...]:
     model = settings_model(reference, near)
     if _is_shipped(reference):
         return model.vehicles
-    kinds = getattr(find(reference, near), "vehicles", None)
-    return model.vehicles if kinds is None else _names(kinds, reference, "vehicles")
-
-
-def _names(given: Any, reference: str, attribute: str) -> tuple[str, ...]:
-    """The names that a policy's attribute holds, one or several; raises `InputError` for anything else."""
-    names = (given,) if isinstance(given, str) else given
-    if isinstance(names, (tuple, list, set, frozenset)) and all(isinstance(name, str) for name in names):
-        return tuple(names)
-    raise InputError.of(
-        f"'{attribute}' of the policy '{reference}' must be a name or a tuple of names", given=repr(given)[:60]
-    )
+    policy = find(reference, near)
+    own = ask(reference, "vehicles", lambda: getattr(policy, "vehicles", None))
+    kinds = names_of(reference, "vehicles", model.vehicles if own is None else own, VEHICLE_KINDS)
+    if not kinds:
+        raise InputError.of(f"'vehicles' of the policy '{reference}' is empty", allowed=one_of(VEHICLE_KINDS))
+    return kinds
 
 
 def senses(reference: str, near: Path | None = None) -> tuple[str, ...]:
@@ -139,17 +137,9 @@ def senses(reference: str, near: Path | None = None) -> tuple[str, ...]:
     """
     if _is_shipped(reference):
         return ()
-    given = getattr(find(reference, near), "senses", ())
-    kinds = _names(given, reference, "senses")
-    for kind in kinds:
-        if kind not in SENSOR_KINDS:
-            raise InputError.of(
-                f"the policy '{reference}' senses '{kind}', which is no kind of sensor",
-                given=str(kind),
-                allowed=one_of(SENSOR_KINDS),
-                suggestion=did_you_mean(str(kind), SENSOR_KINDS),
-            )
-    return kinds
+    policy = find(reference, near)
+    given = ask(reference, "senses", lambda: getattr(policy, "senses", ()))
+    return names_of(reference, "senses", given, SENSOR_KINDS)
 
 
 def digest(reference: str, near: Path | None = None) -> str:
@@ -207,7 +197,9 @@ def _named(name: str) -> Any:
 def _loaded_entry_point(name: str, point: EntryPoint) -> Any:
     try:
         return point.load()
-    except Exception as error:
+    except BaseException as error:
+        if stop := stop_of(error):
+            raise stop from None
         raise InputError.of(
             f"the entry point '{point.value}' of the policy '{name}' cannot be loaded: {_words(error)}", given=name
         ) from error
@@ -221,7 +213,10 @@ def _existing_file(reference: str, near: Path | None) -> Path:
         if files.is_file(folder / path):
             return (folder / path).resolve()
     beside = sorted(
-        str(path.parent / p.name) for folder in folders for p in files.listing((folder / path).parent, "*.py")
+        str(path.parent / p.name)
+        for folder in folders
+        for p in files.listing((folder / path).parent, "*.py")
+        if files.is_file(p)
     )
     raise InputError.of(
         f"there is no file '{path}' to take a policy from",
@@ -252,8 +247,10 @@ def _executed(reference: str, path: Path, sha256: str) -> ModuleType:
     sys.path.insert(0, str(path.parent))
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
-        del sys.modules[spec.name]
+    except BaseException as error:
+        sys.modules.pop(spec.name, None)
+        if stop := stop_of(error):
+            raise stop from None
         line = error.lineno if isinstance(error, SyntaxError) else None
         for frame in traceback.extract_tb(error.__traceback__):
             line = frame.lineno if frame.filename == str(path) else line
@@ -261,14 +258,17 @@ def _executed(reference: str, path: Path, sha256: str) -> ModuleType:
         message = f"the file of the policy cannot be imported: {where}: {_words(error)}"
         raise InputError.of(message, given=reference, suggestion="mend the Python file") from error
     finally:
-        sys.path.remove(str(path.parent))
+        with suppress(ValueError):  # the file may have changed it
+            sys.path.remove(str(path.parent))
     return module
 
 
 def _module(reference: str, name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
-    except (Exception, SystemExit) as error:
+    except BaseException as error:
+        if stop := stop_of(error):
+            raise stop from None
         if isinstance(error, ModuleNotFoundError) and error.name and f"{name}.".startswith(f"{error.name}."):
             hint = f"install it, or name its file: '{name.rpartition('.')[2]}.py:{reference.rpartition(':')[2]}'"
             raise InputError.of(f"there is no module '{error.name}'", given=reference, suggestion=hint) from error
@@ -276,8 +276,10 @@ def _module(reference: str, name: str) -> ModuleType:
 
 
 def _attribute(reference: str, module: ModuleType, name: str) -> Any:
-    if hasattr(module, name):
-        return getattr(module, name)
+    nothing = object()
+    found = ask(reference, f"the module of the object '{name}'", lambda: getattr(module, name, nothing))
+    if found is not nothing:
+        return found
     known = [n for n, value in vars(module).items() if not n.startswith("_") and _fault(value) is None]
     raise InputError.of(
         f"'{reference.rpartition(':')[0]}' holds no object '{name}'",
@@ -294,7 +296,9 @@ def _made(reference: str, policy: Any) -> Any:
             if policy not in _instances:
                 _instances[policy] = policy()
             policy = _instances[policy]
-        except Exception as error:
+        except (Exception, SystemExit) as error:
+            if stop := stop_of(error):
+                raise stop from None
             raise InputError.of(
                 f"the policy '{reference}' cannot be made without arguments: {_words(error)}",
                 given=reference,
@@ -306,12 +310,20 @@ def _made(reference: str, policy: Any) -> Any:
             given=reference,
             allowed="an object or class with start(task, key) and act(task, memory, view, key), or with plan",
         )
+    check_attributes(policy, reference)
     return policy
 
 
 def _fault(policy: Any) -> str | None:
     """Why an object is no policy, or None when it is one."""
-    start, act, plan = (callable(getattr(policy, name, None)) for name in ("start", "act", "plan"))
+
+    def has(name: str) -> bool:
+        try:
+            return callable(getattr(policy, name, None))
+        except Exception:  # of a user's object, which is then no policy
+            return False
+
+    start, act, plan = map(has, ("start", "act", "plan"))
     if plan or (start and act):
         return None
     if act:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from swarmsim.cli import main
 from swarmsim.config.errors import InputError
 from swarmsim.config.policies import SETTINGS, PolicySettings
 from swarmsim.config.scenario import load_scenario
@@ -251,6 +252,98 @@ def test_names_that_are_none_are_refused(project: Path, line: str) -> None:
     asked = registry.senses if line.startswith("senses") else registry.vehicle_kinds
     with pytest.raises(InputError, match="must be a name or a tuple of names"):
         asked("wrong.py:climb")
+
+
+OF_SETTINGS = {
+    "needs = 5": "'needs' of the policy 'wrong.py:climb' must be a name or a tuple of names",
+    "needs = ('sorce',)": "'needs' of the policy 'wrong.py:climb' names 'sorce'",
+    "needs = property(lambda self: 1 / 0)": "needed() of the policy 'wrong.py:climb' fails: wrong.py:7: ZeroDivision",
+    "def needed(self): return None": "'needs' of the policy 'wrong.py:climb' must be a name or a tuple of names",
+    "partners = ['altitude_m']": "'partners' of the policy 'wrong.py:climb' must be a mapping",
+    "partners = {'altitud_m': 'skid_steer'}": "must name settings that are names",
+    "partners = {'altitude_m': 'skid_steer'}": "must name settings that are names",
+    "partners = {'mate': 'rover'}; mate: str = 'uav2'": "'partners' of the policy 'wrong.py:climb' names no kind",
+    "def faults(self, kinds): return None": "faults() of the policy 'wrong.py:climb' must give pairs",
+    "def faults(self, kinds): yield 'gain_m'": "faults() of the policy 'wrong.py:climb' must give pairs",
+    "def faults(self, kinds): yield 1, 2": "faults() of the policy 'wrong.py:climb' must give pairs",
+    "def faults(self, kinds): yield 1 / 0": "faults() of the policy 'wrong.py:climb' fails: wrong.py:7: ZeroDivision",
+    "def faults(self): return []": "faults() of the policy 'wrong.py:climb' fails",
+    "def faults(self, kinds): raise SystemExit(3)": "faults() of the policy 'wrong.py:climb' fails: wrong.py:7: System",
+    "def faults(self, kinds): yield 'gain_m', 'is wrong'": "phases.0.settings.gain_m: is wrong",
+    "vehicles = ('drone',)": "",
+    "def model_post_init(self, context): return {}['x']": "a validator of the settings of the policy",
+}
+
+
+@pytest.mark.parametrize(("line", "fragment"), OF_SETTINGS.items())
+def test_settings_that_answer_with_what_is_none(project: Path, line: str, fragment: str) -> None:
+    Path("wrong.py").write_text(CLIMB.replace("    altitude_m: float", f"    altitude_m: float\n    {line}"))
+    override = phase_of("{altitude_m: 12}", "wrong.py:climb")
+    if not fragment:  # the policy's own vehicles come before those of its settings
+        assert load_scenario(project, [override]).settings[0].altitude_m == 12
+        return
+    with pytest.raises(InputError) as caught:
+        load_scenario(project, [override])
+    message = str(caught.value)
+    assert fragment in message
+    assert "--set phases.0." in message
+
+
+OF_POLICY = {
+    "vehicles = ()": "'vehicles' of the policy 'wrong.py:climb' is empty",
+    "vehicles = 'drone'": "'vehicles' of the policy 'wrong.py:climb' names 'drone'",
+    "vehicles = property(lambda self: 1 / 0)": "vehicles of the policy 'wrong.py:climb' fails: wrong.py:11: Zero",
+    "senses = property(lambda self: 1 / 0)": "senses of the policy 'wrong.py:climb' fails: wrong.py:11: Zero",
+    "senses = 'imo'": "did you mean 'imu'?",
+    "period_s = 'x'": "'period_s' of the policy 'wrong.py:climb' must be a number of seconds",
+    "period_s = float('nan')": "'period_s' of the policy 'wrong.py:climb' must be a number of seconds",
+    "task = 5": "'task' of the policy 'wrong.py:climb' must be a method",
+    "done = 5": "'done' of the policy 'wrong.py:climb' must be a method",
+}
+
+
+@pytest.mark.parametrize(("line", "fragment"), OF_POLICY.items())
+def test_a_policy_whose_attributes_are_none(project: Path, line: str, fragment: str) -> None:
+    text = CLIMB.replace('    vehicles = ("multirotor",)\n    period_s = 0.5', f"    {line}")
+    Path("wrong.py").write_text(text)
+    with pytest.raises(InputError) as caught:
+        load_scenario(project, [phase_of("{altitude_m: 12}", "wrong.py:climb")])
+    message = str(caught.value)
+    assert fragment in message
+    assert message.startswith("--set phases.0.policy: ")
+
+
+MEETS = {
+    "the module": "raise KeyboardInterrupt",
+    "a class being made": "class Meets:\n    def __set_name__(self, *of):\n        raise KeyboardInterrupt\n\n\n"
+    "class Owner:\n    meets = Meets()",
+    "what makes the policy": "class Climb(Climb):\n    def __init__(self):\n        raise KeyboardInterrupt",
+}
+
+
+@pytest.mark.parametrize("text", MEETS.values(), ids=MEETS)
+def test_ctrl_c_in_the_file_of_a_policy_is_ctrl_c(project: Path, capsys: pytest.CaptureFixture[str], text: str) -> None:
+    Path("slow.py").write_text(f"{CLIMB}\n\n{text}\n")
+    for find_it in (find, registry.settings_model):
+        with pytest.raises(KeyboardInterrupt):
+            find_it("slow.py:Climb")
+    mission = project.with_name("mine.yaml")
+    phase = "{name: a, who: uav1, policy: 'slow.py:Climb', settings: {altitude_m: 9}, time_limit_s: 9}"
+    mission.write_text(f"extends: recon\nname: mine\nphases: [{phase}]\n")
+    assert main(["check", str(mission)]) == 130
+    assert capsys.readouterr().err.strip() == "stopped with Ctrl-C: nothing unfinished was left behind"
+
+
+@pytest.mark.parametrize("line", ["sys.path.clear()", "del sys.modules[__name__]", "del sys.modules[__name__]; 1 / 0"])
+def test_a_file_may_do_to_the_interpreter_what_it_likes(
+    project: Path, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    Path("rude.py").write_text(f"import sys\n\n{CLIMB}\n{line}\n")
+    if "1 / 0" in line:
+        assert "ZeroDivisionError" in message_of("rude.py:climb")
+    else:
+        assert find("rude.py:climb").period_s == 0.5
 
 
 def test_names_may_be_given_as_a_set(project: Path) -> None:
