@@ -25,6 +25,7 @@ from swarmsim.config.base import (
 from swarmsim.config.radiation import DetectorMount
 from swarmsim.config.sensors import SensorNames
 from swarmsim.config.sourced import Sourced
+from swarmsim.config.vehicle_checks import multirotor_fault, skid_steer_fault
 
 
 def _inertia(numbers: tuple[float, ...]) -> tuple[float, ...]:
@@ -52,8 +53,6 @@ Inertia = Annotated[tuple[Moment, ...], Field(min_length=3, max_length=6), After
 principal ones, or the six elements [Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of the tensor, in the order of MuJoCo's
 ``fullinertia``. As there and in URDF the last three are the elements themselves, Ixy the integral of -x y dm."""
 
-
-SINGULAR = 1e-4  # of the largest: a smaller singular value of what rotors do is none
 
 Drag = Annotated[float, Field(ge=0, le=1000)]  # kg/m
 Argument = Annotated[float, Field(ge=-1e9, le=1e9)] | Annotated[int, Field(ge=-(10**9), le=10**9)]
@@ -174,52 +173,9 @@ class Multirotor(Sourced):
 
     @model_validator(mode="after")
     def _can_fly(self) -> "Multirotor":
-        rotor = self.rotor
-        if rotor.speed_max_rad_s <= rotor.speed_min_rad_s:
-            raise ValueError("rotor.speed_max_rad_s must be more than rotor.speed_min_rad_s")
-        thrust = len(self.rotors) * rotor.thrust_coefficient_n_s2 * rotor.speed_max_rad_s**2
-        if thrust <= 9.81 * self.mass_kg:
-            raise ValueError(
-                f"the rotors lift {thrust:.1f} N at most, the vehicle weighs {9.81 * self.mass_kg:.1f} N: "
-                "check mass_kg, rotor.thrust_coefficient_n_s2 and rotor.speed_max_rad_s"
-            )
-        if len({r.spin for r in self.rotors}) < 2:
-            raise ValueError("rotors must turn both ways (spin ccw and cw), or nothing holds the yaw")
-        if fault := self._rotors_fault():
+        if fault := multirotor_fault(self):
             raise ValueError(fault)
         return self
-
-    @property
-    def effectiveness(self) -> np.ndarray:
-        """Matrix [4, R] from rotor thrusts (N) to total thrust (N) and torque x, y, z (N m, body)."""
-        arms = np.array([rotor.position_m for rotor in self.rotors])
-        yaw = [self.rotor.moment_constant_m * (-1.0 if rotor.spin == "ccw" else 1.0) for rotor in self.rotors]
-        return np.stack([np.ones(len(arms)), arms[:, 1], -arms[:, 0], yaw])
-
-    def _rotors_fault(self) -> str | None:
-        """Why the rotors cannot hold the vehicle: they do not move all of it, or lift it beside its centre of mass."""
-        level = np.array([rotor.position_m[:2] for rotor in self.rotors])
-        least, spread = SINGULAR * np.abs(level).max(), np.linalg.svd(level - level.mean(axis=0), compute_uv=False)
-        if spread[1] <= least:
-            line = "on one line" if spread[0] > least else "at one point"
-            return f"the rotors stand {line} seen from above, so that they cannot tilt the vehicle to all sides"
-        matrix = self.effectiveness
-        strength = np.linalg.svd(matrix / np.abs(matrix).max(axis=1, keepdims=True), compute_uv=False)
-        if len(self.rotors) < 4 or strength[3] < SINGULAR * strength[0]:
-            return (
-                "the rotors cannot lift, roll, pitch and yaw the vehicle independently of each other: it takes four or "
-                "more, and neighbours that turn opposite ways (spin)"
-            )
-        weight = 9.81 * self.mass_kg
-        hover = np.linalg.pinv(matrix) @ [weight, 0.0, 0.0, 0.0]
-        most = self.rotor.thrust_coefficient_n_s2 * self.rotor.speed_max_rad_s**2
-        if hover.min() < -SINGULAR * weight or hover.max() > most:
-            thrusts = ", ".join(f"{thrust:.3g}" for thrust in hover)
-            return (
-                f"the rotors cannot hold the vehicle level: it takes thrusts of {thrusts} N, and each gives 0 to "
-                f"{most:.3g} N. Their places are from the centre of mass, which must lie among them"
-            )
-        return None
 
 
 class Castors(Model):
@@ -307,9 +263,9 @@ class SkidSteer(Sourced):
     sensors: SensorNames = ()
 
     @model_validator(mode="after")
-    def _heavier_than_its_wheels(self) -> "SkidSteer":
-        if self.mass_kg <= 4 * self.wheels.mass_kg:
-            raise ValueError("mass_kg is the whole rover: it must be more than four times wheels.mass_kg")
+    def _can_drive(self) -> "SkidSteer":
+        if fault := skid_steer_fault(self):
+            raise ValueError(fault)
         return self
 
 

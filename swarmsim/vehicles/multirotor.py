@@ -15,6 +15,7 @@ import numpy as np
 
 from swarmsim.config.errors import InputError
 from swarmsim.config.flight import FlightEffects
+from swarmsim.config.vehicle_checks import effectiveness
 from swarmsim.config.vehicles import Multirotor, RotorModel, inertia_tensor
 from swarmsim.pytree import on_device, pytree
 from swarmsim.vehicles.battery import BatteryParams
@@ -193,7 +194,7 @@ def control_params(spec: Multirotor, air: RotorAir) -> ControlParams:
     numbers = {
         "mass_kg": spec.mass_kg,
         "inertia_kg_m2": moments,
-        "allocation": np.linalg.pinv(spec.effectiveness),
+        "allocation": np.linalg.pinv(effectiveness(spec)),
         "thrust_coefficient_n_s2": rotor.thrust_coefficient_n_s2,
         "speed_min_rad_s": rotor.speed_min_rad_s,
         "speed_max_rad_s": rotor.speed_max_rad_s,

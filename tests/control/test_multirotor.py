@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarmsim.config.vehicle_checks import effectiveness
 from swarmsim.control.commands import PositionCommand
 from swarmsim.control.multirotor import LANDED_AFTER_S, rotor_commands
 from tests.flights import airborne, attitude, fly_controlled, hover_speed, params_of, plane, spec_of
@@ -23,7 +24,7 @@ def achieved(thrust, torque, name="tarot_t650"):
     rotor = spec_of(name).rotor
     assert (commands >= rotor.speed_min_rad_s * (1 - 1e-4)).all()
     assert (commands <= rotor.speed_max_rad_s * (1 + 1e-4)).all()
-    return spec_of(name).effectiveness @ (rotor.thrust_coefficient_n_s2 * commands.astype(np.float64) ** 2)
+    return effectiveness(spec_of(name)) @ (rotor.thrust_coefficient_n_s2 * commands.astype(np.float64) ** 2)
 
 
 @given(st.floats(25.0, 45.0), torques, torques, st.floats(-0.1, 0.1))

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from swarmsim.config.vehicle_checks import effectiveness
 from swarmsim.config.vehicles import Multirotor, inertia_tensor
 from swarmsim.control.commands import BodyRateCommand, PositionCommand, multirotor_command
 from swarmsim.control.multirotor import control, control_start
@@ -150,7 +151,7 @@ def test_the_controller_asks_for_the_torque_of_the_tensor():
     speeds, memory = control(params, control_start(), state, wanted, 0.01)
     rate = np.array([0.1, 0.2, -0.05])
     change = spec.control.rate_gain_1_s * (np.asarray(command) - rate + np.asarray(memory.rate_integral_rad_s))
-    torque = spec.effectiveness[1:] @ (spec.rotor.thrust_coefficient_n_s2 * np.asarray(speeds) ** 2)
+    torque = effectiveness(spec)[1:] @ (spec.rotor.thrust_coefficient_n_s2 * np.asarray(speeds) ** 2)
     np.testing.assert_allclose(torque, TENSOR @ change + np.cross(rate, TENSOR @ rate), atol=1e-4)
 
 
