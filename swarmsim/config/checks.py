@@ -106,7 +106,8 @@ def _check_timing(scenario: Scenario) -> Iterator[Problem]:
         elif detector.sample_period_s < timing.judge_period_s - 0.5 * timing.control_period_s:
             yield scenario.problem(
                 ("timing", "judge_period_s"),
-                f"is longer than the sample_period_s of the detector '{name}'",
+                f"the sample_period_s of {detector.sample_period_s:g} s of the detector '{name}' is shorter than "
+                "timing.judge_period_s",
                 given=f"{timing.judge_period_s:g}",
                 allowed=f"at most {detector.sample_period_s:g}",
             )
@@ -233,6 +234,10 @@ def _check_estimates(scenario: Scenario) -> Iterator[Problem]:
     if mission.mapping is not None and all(vehicle.detector is None for vehicle in scenario.vehicles):
         message = "there is nothing to map: no vehicle of the team carries a detector"
         yield scenario.problem(("mapping",), message, suggestion="leave it out, or give a vehicle type a detector")
+    named = mission.knowledge.nuclides
+    for k, name in enumerate(named if isinstance(named, tuple) else ()):
+        if name in named[:k]:
+            yield scenario.problem(("knowledge", "nuclides", k), "is named twice", given=name)
     if mission.localisation is not None and mission.mapping is None:
         message = "the estimate starts from the hotspots of the map, and the mission has no mapping"
         yield scenario.problem(("localisation",), message, suggestion="add mapping, or leave localisation out")

@@ -10,20 +10,16 @@ import numpy as np
 
 from swarmsim.config.documents import Place
 from swarmsim.config.errors import InputError, Problem, first_problems
-from swarmsim.config.phases import CEILING_HINT
+from swarmsim.config.fence_checks import check_fence
 from swarmsim.config.policies import ApproachAndOrbit, Orbit, ParallelLines, Waypoints, line_spacing
 from swarmsim.config.scenario import Scenario
-from swarmsim.config.site_ground import Floats, Ground, point_text
+from swarmsim.config.site_ground import Ground, point_text
 from swarmsim.config.sources import points_of
 from swarmsim.config.start_checks import check_starts
-from swarmsim.config.vehicles import Multirotor
+from swarmsim.config.vehicles import Multirotor, SkidSteer
 
 if TYPE_CHECKING:
     from swarmsim.site import SiteModel
-
-
-ROUNDING_M = 1e-3  # of places in float32
-ABOVE_M = 0.5  # over the ceiling: by less a path that cuts a corner may stay below it
 
 
 def check_site(scenario: Scenario, model: SiteModel | None = None) -> list[Problem]:
@@ -38,7 +34,7 @@ def check_site(scenario: Scenario, model: SiteModel | None = None) -> list[Probl
     ground = Ground(model.site, scenario)
     if vehicles := first_problems(_check_vehicles(scenario)):
         return vehicles  # without its body nothing is known of a vehicle's outline
-    checks = (_check_sources, check_starts, _check_areas, _check_fence, _check_points, _check_ceiling, _check_map)
+    checks = (_check_sources, check_starts, _check_areas, check_fence, _check_points, _check_traffic, _check_map)
     return first_problems(problem for check in checks for problem in check(scenario, ground))
 
 
@@ -116,88 +112,6 @@ def _check_areas(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
             )
 
 
-def _check_fence(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
-    """Survey lines that end nearer to the fence than a vehicle stops in: its failsafe would end the survey there."""
-    fence = scenario.mission.failsafes.fence
-    surveys = [(i, own) for i, own in enumerate(scenario.settings) if isinstance(own, ParallelLines)]
-    if fence.action == "none" or not surveys:
-        return
-    import jax.numpy as jnp
-
-    from swarmsim.world.failsafes import stopping_m
-
-    for i, own in surveys:
-        members = [scenario.vehicles[k] for k in scenario.phase_members[i]]
-        brake = min(vehicle.control.acceleration_max_m_s2 for vehicle in members)
-        area, sweep, spacing = np.array(own.area_m or ground.area), math.radians(own.sweep_deg), line_spacing(own)
-        if not all(ground.holds(corner) for corner in area):  # told of already
-            continue
-        first, last = _survey_lines(area, sweep, spacing)
-        stop = float(stopping_m(jnp.float32(own.speed_m_s), brake))
-        onward = stop * np.array([math.cos(sweep), math.sin(sweep)])
-        ends, ahead = np.concatenate([first, last]), np.concatenate([first - onward, last + onward])
-        low, high = ground.fence(fence.margin_m)
-        beyond = np.max(np.maximum(low - ahead, ahead - high), axis=1)
-        worst = int(np.argmax(beyond))
-        if beyond[worst] > ROUNDING_M:
-            place: Place = ("phases", i, "settings", "area_m" if own.area_m is not None else "speed_m_s")
-            yield scenario.problem(
-                place,
-                f"a survey line ends so near to the fence that a vehicle at {own.speed_m_s:g} m/s could not stop "
-                "before it: its failsafe would bring it home",
-                given=f"{stop - beyond[worst]:.3g} m from the fence, at {point_text(ends[worst])}",
-                allowed=f"at least {stop:.3g} m",
-                suggestion="a smaller area_m, or survey_area_m in the site's file, a lower speed_m_s, or another "
-                "failsafes.fence",
-            )
-
-
-def _survey_lines(area: Floats, sweep: float, spacing: float) -> tuple[Floats, Floats]:
-    """Ends [L, 2], [L, 2] of the lines of a survey over ``area`` [V, 2] in the direction ``sweep`` (rad)."""
-    import jax
-    import jax.numpy as jnp
-
-    from swarmsim.policies.coverage import lines_needed, survey_lines
-
-    cut = jax.jit(survey_lines, static_argnums=3)  # one by one its operations take a second to compile
-    lines = lines_needed(area, spacing, sweep)
-    start, end, used = cut(jnp.asarray(area), jnp.float32(sweep), jnp.float32(spacing), lines)
-    return np.asarray(start, float)[np.asarray(used)], np.asarray(end, float)[np.asarray(used)]
-
-
-def _check_ceiling(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
-    """Survey lines and waypoints over things so high that the way above them leads through the fence's ceiling."""
-    fence = scenario.mission.failsafes.fence
-    if fence.action == "none":
-        return
-    for i, own in enumerate(scenario.settings):
-        flies = any(isinstance(scenario.vehicles[k], Multirotor) for k in scenario.phase_members[i])
-        if not flies or not isinstance(own, ParallelLines | Waypoints) or (own.altitude_m or 0.0) >= fence.ceiling_m:
-            continue  # too high over bare ground is told without a site
-        if isinstance(own, ParallelLines):
-            area = np.array(own.area_m or ground.area)
-            ends = np.stack(_survey_lines(area, math.radians(own.sweep_deg), line_spacing(own)), axis=1)
-        else:
-            corners = np.array(own.points)
-            ends = np.stack([corners[:-1], corners[1:]], axis=1)
-        for first, last in ends:
-            xy = np.linspace(first, last, max(2, math.ceil(math.dist(first, last) / ground.cell)))
-            over = ground.rises(xy) + own.obstacle_clearance_m
-            over = np.minimum(over[:-1], over[1:])  # what is narrower than a cell may fall between a path's points
-            worst = int(np.argmax(over))
-            if over[worst] > fence.ceiling_m + ABOVE_M:
-                field = "points" if isinstance(own, Waypoints) else "area_m" if own.area_m is not None else "altitude_m"
-                yield scenario.problem(
-                    ("phases", i, "settings", field),
-                    f"the way leads {over[worst]:.3g} m above the terrain, over what stands there, and the fence's "
-                    f"ceiling is lower: the failsafe would take over (action {fence.action})",
-                    given=f"obstacle_clearance_m {own.obstacle_clearance_m:g}, at {point_text(xy[worst])}",
-                    allowed=f"less than {fence.ceiling_m:g} m (failsafes.fence.ceiling_m)",
-                    suggestion=CEILING_HINT,
-                )
-                break
-
-
 def _check_points(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     """Waypoints and targets beyond the site."""
     for i, settings in enumerate(scenario.settings):
@@ -211,6 +125,23 @@ def _check_points(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
                 message = f"the {'waypoint' if place[0] == 'points' else 'target'} lies outside the site"
                 given = str(list(point))
                 yield scenario.problem(("phases", i, "settings", *place), message, given=given, allowed=ground.extent)
+
+
+def _check_traffic(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
+    """Distances to keep that are longer than the site."""
+    across = math.dist(ground.low, ground.high)
+    allowed = f"less than the {across:.4g} m from corner to corner of the site"
+    kept = (("separation_m", Multirotor, "UAVs"), ("ground_separation_m", SkidSteer, "rovers"))
+    for field, kind, what in kept:
+        distance = getattr(scenario.mission.traffic, field)
+        if sum(isinstance(vehicle, kind) for vehicle in scenario.vehicles) > 1 and distance >= across:
+            message = f"the {what} of the team can nowhere be so far apart"
+            yield scenario.problem(("traffic", field), message, given=f"{distance:g}", allowed=allowed)
+    for i, settings in enumerate(scenario.settings):
+        if isinstance(settings, ApproachAndOrbit) and settings.standoff_m >= across:
+            message, place = "no viewpoint so far from the target lies on the site", ("phases", i, "settings")
+            given = f"{settings.standoff_m:g}"
+            yield scenario.problem((*place, "standoff_m"), message, given=given, allowed=allowed)
 
 
 def _check_map(scenario: Scenario, ground: Ground) -> Iterator[Problem]:

@@ -68,7 +68,7 @@ def _start_fault(scenario: Scenario, ground: Ground, i: int, xy: Floats) -> tupl
     fence = scenario.mission.failsafes.fence
     if isinstance(vehicle, Multirotor) and fence.action != "none":
         low, high = ground.fence(fence.margin_m)
-        if np.any(xy < low) or np.any(xy > high):
+        if np.all(low < high) and (np.any(xy < low) or np.any(xy > high)):  # a fence round nothing is told as such
             (west, south), (east, north) = low, high
             return "outside the fence, which is the site's outline less failsafes.fence.margin_m", {
                 "allowed": f"x from {west:g} to {east:g}, y from {south:g} to {north:g}"

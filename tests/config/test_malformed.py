@@ -212,8 +212,13 @@ OVERRIDES = {
     ),
     "judged too seldom": (
         "timing.judge_period_s=0.2",
-        ["--set timing.judge_period_s: is longer than the sample_period_s of the detector 'nai", "at most 0.1"],
+        ["--set timing.judge_period_s: the sample_period_s of 0.1 s of the detector 'nai", "at most 0.1"],
     ),
+    "a nuclide twice": (
+        "knowledge.nuclides=[Co-60, Cs-137, Co-60]",
+        ["--set knowledge.nuclides.2: is named twice", "given:   Co-60"],
+    ),
+    "a vehicle twice": ("phases.survey.who=[uav1, uav2, uav1]", ["--set phases.0.who: names 'uav1' twice"]),
     "line beyond crystals": (
         "definitions.nuclides.Co-60.lines=[{energy_kev: 6129, yield_percent: 67}]",
         ["--set definitions.nuclides.Co-60.lines.0.energy_kev: lies beyond the response", "at most 3400"],

@@ -25,6 +25,11 @@ OVER = (
     "settings: {speed_m_s: 1, altitude_m: 9, points: [[-60, 24], [60, 24]]}}"
 )
 
+CIRCLE = (
+    "phases.1={{name: b, who: uav1, policy: orbit, time_limit_s: 9, start: {{after: survey}}, "
+    "settings: {{radius_m: {}, altitude_m: 9, speed_m_s: 1, target: {}}}}}"
+)
+
 # 160 m x 140 m around the origin, 2 m high ground. Boxes: a building of 20 x 10 x 6 m with walls of 0.3 m, turned by
 # 90 degrees; a solid wall of 20 x 1 x 4 m; a hedge of 4 x 4 x 2 m; a place holder of no size.
 CENTRES = [[0.0, 0.0, 5.0], [40.0, 20.0, 4.0], [-30.0, 30.0, 3.0], [0.0, 0.0, 2.0]]
@@ -86,6 +91,11 @@ def test_the_mission_fits(mission: Path, site: SiteModel) -> None:
             "definitions.vehicles.tarot_t650.feet.stiffness_n_m=1e9", "vehicles.0.type",
             ["a time step of 0.005 s is too long for the feet of tarot_t650"],
         ),
+        ("failsafes.fence.margin_m=70", "failsafes.fence.margin_m", ["leaves nothing of the site", "less than 69.5"]),
+        ("traffic.separation_m=220", "traffic.separation_m", ["the UAVs of the team can nowhere", "the 212.6 m from"]),
+        ("phases.search.settings.standoff_m=220", "phases.1.settings.standoff_m", ["no viewpoint so far", "212.6"]),
+        (CIRCLE.format(61, "[20, 0]"), "phases.1.settings.radius_m", ["leads over the fence", "come to [81, 0]"]),
+        (CIRCLE.format(72, "hotspot"), "phases.1.settings.radius_m", ["round any target", "at most 69.5"]),
         ("mapping.cell_m=0.05", "mapping.cell_m", ["a map of 2800 x 2400 cells", "at most 250000", "larger cell_m"]),
         ("mapping.length_scale_m=0.01", "mapping.length_scale_m", ["too short", "at most 1024", "given:   0.01"]),
         (f"{SURVEY}.line_spacing_m=130", FIRST, ["no room for one survey line", "smaller line_spacing_m"]),
@@ -201,3 +211,14 @@ def test_a_vehicle_whose_body_cannot_be_read(mission: Path, site: SiteModel) -> 
     assert [(Path(problem.file or "").name, problem.message[:21]) for problem in problems] == [
         ("body.urdf", "the body has no mass:")
     ] * 2
+
+
+def test_a_waypoint_between_the_fence_and_the_edge_of_the_site(mission: Path, site: SiteModel) -> None:
+    phase = f"phases.1={OVER.replace('[60, 24]', '[77, 24]')}"
+    scenario = load_scenario(mission, [phase, "failsafes.fence.margin_m=4", f"{SURVEY}.speed_m_s=1"])
+    (problem,) = check_site(scenario, site)
+    assert problem.path == "phases.1.settings.points.1"
+    assert "the waypoint lies outside the fence" in str(problem)
+    assert "x from -75.5 to 75.5" in str(problem)
+    free = ["failsafes.fence={margin_m: 4, action: none}", f"{SURVEY}.speed_m_s=1"]
+    assert check_site(load_scenario(mission, [phase, *free]), site) == []
