@@ -1,5 +1,6 @@
 """The application of the command line, and how its values are read."""
 
+import re
 from collections.abc import Sequence
 from functools import partial
 
@@ -11,7 +12,7 @@ SEED_END = 2**31
 def whole(_: object, tokens: Sequence[Token]) -> int:
     """A whole number; cyclopts alone would round another one."""
     text = tokens[0].value
-    if not text.lstrip("+-").isdecimal():
+    if not re.fullmatch(r"[+-]?[0-9]+", text):
         raise ValueError(f"a whole number is needed, not '{text[:100]}'")
     return int(text[:100])
 

@@ -22,7 +22,7 @@ from swarmsim.site.raster import Floats, Grid, faces_on, top_of_cells
 from swarmsim.site.source_files import TIFF_SUFFIXES, check_file
 from swarmsim.site.start_places import start_places
 from swarmsim.site.step_edges import StepRasters, find_steps
-from swarmsim.site.survey import survey_area
+from swarmsim.site.survey import check_zones, survey_area
 from swarmsim.site.visual import visual_mesh
 
 Mask = NDArray[np.bool_]
@@ -68,11 +68,15 @@ class _Separated:
 
 
 def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
+    if spec.orthophoto is not None:
+        message = "is for elevation models: a mesh has colours of its own"
+        raise InputError.of(message, path="orthophoto", given=spec.orthophoto, suggestion="leave it out")
     mesh = read_mesh(path, spec)
     parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh.parts, spec.plane)]
     check_patterns(parts, spec, path)
     corners = np.concatenate([part.corners for part in parts])
     grid = _grid_of(corners, spec, path)
+    check_zones(grid, spec)
     found = _separate(parts, corners, grid, spec, path)
     ground = found.ground
     things = find_obstacles(parts, found.bare, spec)
@@ -115,6 +119,7 @@ def _from_elevation(path: Path, spec: SiteSpec) -> RawSite:
     shift = 0.5 * (spec.cell_m - model.grid.cell)
     origin = (model.grid.origin[0] + shift, model.grid.origin[1] + shift)
     grid = model.grid if spec.cell_m == model.grid.cell else Grid(origin, spec.cell_m, ny, nx)
+    check_zones(grid, spec)
     ground = elevation_ground(model, grid, spec)
     nothing = np.empty((0, 3, 3))
     clear = traversability.clearance(grid, ground.height, ground.outside, nothing, [], spec.zones, spec.traversability)

@@ -17,7 +17,7 @@ import numpy as np
 import platformdirs
 
 from swarmsim.atomic_folder import atomic_folder
-from swarmsim.config.documents import dump_yaml
+from swarmsim.config.documents import dump_yaml, shown_path
 from swarmsim.config.errors import InputError, Problem, file_errors_told
 from swarmsim.config.files import available, find
 from swarmsim.config.load import load_all, load_model, load_named
@@ -97,7 +97,11 @@ def _arrays(spec: SiteSpec, site_file: Path) -> Arrays:
         return _checked(dict(arrays))
     from swarmsim.site.importer import build
 
-    fresh = _pack(build(source, spec))
+    try:
+        fresh = _pack(build(source, spec))
+    except InputError as error:
+        here = shown_path(site_file)
+        raise InputError(replace(told, file=told.file or here) for told in error.problems) from error
     with contextlib.suppress(OSError):  # a cache that cannot be written only costs time
         entry.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile(dir=entry.parent, suffix=".tmp", delete=False) as beside:

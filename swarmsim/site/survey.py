@@ -54,6 +54,19 @@ def _hull(points: Floats) -> Floats:
     return np.array(chain(ordered) + chain(ordered[::-1]))
 
 
+def check_zones(grid: Grid, spec: SiteSpec) -> None:
+    """Raise `InputError` for a zone that lies beside the site, where it closes nothing."""
+    low, high = grid.bounds
+    for k, zone in enumerate(spec.zones):
+        corners = np.array(zone.polygon_m)
+        if (corners.max(axis=0) <= low).any() or (corners.min(axis=0) >= high).any():
+            raise InputError.of(
+                f"the zone '{zone.name}' lies outside the site", path=f"zones.{k}.polygon_m",
+                given=str(corners.tolist()),
+                allowed=f"x from {low[0]:g} to {high[0]:g} m, y from {low[1]:g} to {high[1]:g} m",
+            )  # fmt: skip
+
+
 def _inside_site(grid: Grid, polygon: Floats) -> Floats:
     """``polygon`` [v, 2], or `InputError` when a corner lies outside the grid."""
     low, high = grid.bounds

@@ -267,6 +267,15 @@ def test_wrong_input_writes_nothing_and_shows_no_traceback(project: Path) -> Non
     assert everything(project) == before
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [["run", "recon", "--seed", "+-3"], ["run", "recon", "--seed", "\u0663"], ["bench", "recon", "--fleet", "1.5"]],
+)
+def test_numbers_that_are_not_whole(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(arguments) == 2
+    assert f"a whole number is needed, not '{arguments[-1]}'" in capsys.readouterr().err
+
+
 def test_seeds_beyond_the_end(project: Path, fly: Callable[[Fly], None], capsys: pytest.CaptureFixture[str]) -> None:
     fly(write_results)
     assert cli.main(["run", "recon", "--seed", str(2**31 - 2), "--missions", "3"]) == 2

@@ -126,6 +126,32 @@ def test_survey_area(tmp_path, polygon, words):
     assert [path.name for path in tmp_path.iterdir()] == ["yard.stl"]
 
 
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"zones": [{"name": "pond", "polygon_m": [[900, 0], [901, 0], [900, 1]]}]},
+         ["zones.0.polygon_m: the zone 'pond' lies outside the site"]),
+        ({"orthophoto": "photo.png"}, ["orthophoto: is for elevation models"]),
+    ],
+)  # fmt: skip
+def test_what_does_nothing_on_a_mesh_is_refused(tmp_path, fields, words):
+    yard().export(tmp_path / "yard.stl")
+    refused(tmp_path / "yard.stl", words, up_axis="Z", unit_m=1.0, **fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"zones": [{"name": "pond", "polygon_m": [[0, 0], [1, 0], [2, 0]]}]}, "has no area"),
+        ({"zones": [{"name": "pond", "polygon_m": [[1, 1], [1, 1], [1, 1]]}]}, "has no area"),
+        ({"default_wall_m": 1000.0}, "default_wall_m"),
+    ],
+)
+def test_zones_of_no_area_and_walls_as_thick_as_a_site(fields, words):
+    with pytest.raises(ValueError, match=words):
+        spec(file="yard.stl", **fields)
+
+
 def test_cells_too_small_and_too_large(tmp_path):
     yard().export(tmp_path / "yard.stl")
     refused(tmp_path / "yard.stl", ["larger cells"], cell_m=0.005)

@@ -63,7 +63,7 @@ def bench(
     scenario: str = "recon",
     *,
     missions: Annotated[int, Parameter(validator=Number(gte=2, lte=1_000_000), converter=whole)] = 64,
-    fleet: Annotated[int, Parameter(validator=Number(gte=0, lte=100_000_000))] = 0,
+    fleet: Annotated[int, Parameter(validator=Number(gte=0, lte=100_000_000), converter=whole)] = 0,
     repeats: Annotated[int, Parameter(validator=Number(gte=1, lte=100), converter=whole)] = 2,
     overrides: Annotated[tuple[str, ...], Parameter(name="--set", consume_multiple=False)] = (),
 ) -> None:
