@@ -179,10 +179,10 @@ def _place_in(into: Document, source: Document, old: Any, key: str, there: Place
     names = _items_named(old)
     if key in names:
         return names.index(key)
-    hint = did_you_mean(key, names)
-    raise InputError(
-        [source.problem(there, f"there is no item '{key}' to change", allowed=one_of(names), suggestion=hint)]
-    )
+    hint, allowed = did_you_mean(key, names), one_of(names)
+    if not any("name" in item for item in old):
+        hint, allowed = "write the whole list", "nothing: the items of this list have no names to change them by"
+    raise InputError([source.problem(there, f"there is no item '{key}' to change", allowed=allowed, suggestion=hint)])
 
 
 def _items_named(value: Any) -> list[str]:

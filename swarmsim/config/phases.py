@@ -212,11 +212,8 @@ def _cycle(waits: dict[str, set[str]]) -> list[str]:
 
 
 def _check_who(scenario: Scenario, i: int) -> Iterator[Problem]:
-    known, named = scenario.groups, set()
+    known = scenario.groups
     for name in scenario.mission.phases[i].who:
-        if name in named:
-            yield scenario.problem(("phases", i, "who"), f"names '{name}' twice", suggestion="leave one of them out")
-        named.add(name)
         if name not in known:
             shown = list(known)[:NAMES_SHOWN]
             allowed = one_of(shown) + (" …" if len(known) > len(shown) else "")

@@ -160,6 +160,8 @@ class Spectrometer(Model):
             raise ValueError("the edges rois_kev must increase")
         if self.threshold_kev >= self.energy_max_kev:
             raise ValueError("threshold_kev must lie below energy_max_kev")
+        if self.rois_kev[0] >= self.energy_max_kev or self.rois_kev[-1] <= self.threshold_kev:
+            raise ValueError("rois_kev lie beyond what is counted, from threshold_kev to energy_max_kev")
         return self
 
 

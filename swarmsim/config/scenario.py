@@ -12,7 +12,7 @@ from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.checks import check_consistency, check_team_size
 from swarmsim.config.definitions import bring_in_definitions, unused_definitions
-from swarmsim.config.documents import Document, Place, dotted, dump_yaml, other_key
+from swarmsim.config.documents import Document, Place, dotted, dump_yaml, other_key, shown_path
 from swarmsim.config.errors import InputError, Problem, raise_if_any
 from swarmsim.config.family import Varied, add_sources, read_family, set_and_varied, varied_paths
 from swarmsim.config.load import load_named, read_document
@@ -114,6 +114,10 @@ def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed:
     """
     path = files.find("missions", name_or_path)
     document = read_document(path, "missions")
+    folder = next((parent.name for parent in path.absolute().parents[:2] if parent.name in files.KINDS), "missions")
+    if folder != "missions" and "phases" not in document.data:
+        message, hint = f"is the file of a {folder.removesuffix('s')}, not of a mission", "swarmsim check reads it"
+        raise InputError.of(message, file=shown_path(path), suggestion=hint)
     overrides = (*_texts(overrides), f"seed={seed}") if seed is not None else _texts(overrides)
     problems = bring_in_definitions(document, overrides, path, partial(Problem, file=ORIGIN))
     unknown = {problem.path for problem in problems}

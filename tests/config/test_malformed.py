@@ -218,7 +218,10 @@ OVERRIDES = {
         "knowledge.nuclides=[Co-60, Cs-137, Co-60]",
         ["--set knowledge.nuclides.2: is named twice", "given:   Co-60"],
     ),
-    "a vehicle twice": ("phases.survey.who=[uav1, uav2, uav1]", ["--set phases.0.who: names 'uav1' twice"]),
+    "regions beyond the spectrum": (
+        "definitions.detectors.nai_2x2.spectrometer.rois_kev=[10000, 20000]",
+        ["definitions.detectors.nai_2x2.spectrometer: rois_kev lie beyond what is counted"],
+    ),
     "line beyond crystals": (
         "definitions.nuclides.Co-60.lines=[{energy_kev: 6129, yield_percent: 67}]",
         ["--set definitions.nuclides.Co-60.lines.0.energy_kev: lies beyond the response", "at most 3400"],
@@ -341,10 +344,20 @@ def test_a_body_file_that_does_not_exist(mission: Path) -> None:
         ("configs/missions/recom.yaml", "did you mean 'configs/missions/recon.yaml'"),
         ("configs/missions", "is a folder"),
         ("no/such/file.yaml", "there is no file 'no/such/file.yaml'"),
+        ("configs/vehicles/x500.yaml", "x500.yaml: is the file of a vehicle, not of a mission"),
+        ("configs/sites/works_yard", "is a folder"),
+        ("configs/sites/works_yard/site.yaml", "site.yaml: is the file of a site, not of a mission"),
     ],
 )
 def test_a_path_that_does_not_exist(mission: Path, name: str, fragment: str) -> None:
     assert fragment in message_of(name)
+
+
+def test_an_item_without_a_name_is_not_changed_by_one(mission: Path) -> None:
+    mission.with_name("mine.yaml").write_text("extends: recon\nname: mine\nsources: {0: {activity_mbq: 1}}\n")
+    message = message_of("mine")
+    assert "mine.yaml:3 sources.0: there is no item '0' to change" in message
+    assert "have no names" in message
 
 
 def test_a_vehicle_of_no_kind(tmp_path: Path) -> None:
