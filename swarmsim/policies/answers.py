@@ -20,6 +20,11 @@ Answer = TypeVar("Answer")
 FOUND = ("source", "hotspot")
 """What a policy can need the mission to find."""
 _SHOWN = 60
+_WORDS = {
+    "needs": ("needs", "thing that a mission finds"),
+    "senses": ("senses", "kind of sensor"),
+    "vehicles": ("commands", "kind of vehicle"),
+}
 
 
 def ask(reference: str, what: str, question: Callable[[], Answer]) -> Answer:
@@ -48,8 +53,9 @@ def names_of(reference: str, what: str, given: Any, known: Sequence[str]) -> tup
         raise InputError.of(message, given=repr(given)[:_SHOWN], allowed=one_of(known))
     for name in names:
         if name not in known:
-            message, hint = f"'{what}' of the policy '{reference}' names '{name}'", did_you_mean(name, known)
-            raise InputError.of(message, given=name, allowed=one_of(known), suggestion=hint)
+            verb, noun = _WORDS[what]
+            message = f"the policy '{reference}' {verb} '{name}', which is no {noun}"
+            raise InputError.of(message, given=name, allowed=one_of(known), suggestion=did_you_mean(name, known))
     return tuple(names)
 
 

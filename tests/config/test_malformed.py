@@ -367,53 +367,6 @@ def test_a_vehicle_of_no_kind(tmp_path: Path) -> None:
             load_model(tmp_path / "v.yaml", Vehicle)
 
 
-ROTORS = {
-    "on one line": (["0.1, 0.2", "0.2, 0.4", "0.3, 0.6", "0.4, 0.8"], "stand on one line seen from above"),
-    "at one point": (["0.1, 0.2"] * 4, "stand at one point seen from above"),
-    "in the middle": (["0.0, 0.0"] * 4, "stand at one point seen from above"),
-    "of one sense on each side": (
-        ["0.2, 0.2", "0.2, -0.2", "-0.2, 0.2", "-0.2, -0.2"],
-        "neighbours that turn opposite",
-    ),
-    "three": (["0.2, 0.2", "0.2, -0.2", "-0.2, 0.0"], "it takes four or more"),
-    "in front": (
-        ["1.2, 0.2", "0.8, 0.2", "1.2, -0.2", "0.8, -0.2"],
-        "cannot hold the vehicle level: it takes thrusts of",
-    ),
-}
-
-
-@pytest.mark.parametrize(("places", "fragment"), ROTORS.values(), ids=ROTORS)
-def test_rotors_that_cannot_hold_a_vehicle(mission: Path, places: list[str], fragment: str) -> None:
-    spins = ["ccw", "ccw", "cw", "cw"] if "neighbours" in fragment else ["ccw", "cw", "cw", "ccw"]
-    rotors = [f"{{position_m: [{xy}, 0.05], spin: {spin}}}" for xy, spin in zip(places, spins, strict=False)]
-    message = message_of(mission, f"definitions.vehicles.tarot_t650.rotors=[{', '.join(rotors)}]")
-    assert fragment in message
-    assert "allowed" not in message
-
-
-UNSOUND = {
-    "tarot_t650.feet.positions_m=[[0.1, 0, -0.2], [0, 0, -0.2], [-0.1, 0, -0.2]]": "the vehicle falls over",
-    "tarot_t650.feet.positions_m=[[0.2, 0.1, -0.2], [0.2, -0.1, -0.2], [0.1, 0, -0.2]]": "the vehicle falls over",
-    "tarot_t650.feet.positions_m=[[0.2, 0.1, 0.2], [0.2, -0.1, -0.2], [-0.2, 0, -0.2]]": "the feet must lie below",
-    "tarot_t650.rotor.speed_min_rad_s=600": "so that it never comes down",
-    "tarot_t650.rotor.speed_max_voltage_v=100": "at the 24.6 V of its full battery the rotors lift",
-    "tarot_t650.battery.cells=1": "at the 4.1 V of its full battery the rotors lift",
-    "tarot_t650.collision_radius_m=0.1": "collision_radius_m must take in propellers and feet, which reach 0.515 m",
-    "tarot_t650.collision_height_m=0.1": "collision_height_m must take in the feet and the rotors",
-    "orpheus.wheels.wheel_base_m=0.3": "the wheels of a side overlap",
-    "orpheus.wheels.track_m=0.05": "the wheels of an axle overlap",
-    "orpheus.chassis_height_m=0.1": "the chassis reaches into the ground",
-    "orpheus.motor.torque_max_nm=0.5": "the wheels push with 10 N at most, and roll against 15 N",
-    "orpheus.wheels.friction=0.02": "the wheels push with 10 N at most, and roll against 15 N",
-}
-
-
-@pytest.mark.parametrize(("override", "fragment"), UNSOUND.items())
-def test_a_vehicle_that_can_neither_fly_nor_drive_nor_stand(mission: Path, override: str, fragment: str) -> None:
-    assert fragment in message_of(mission, f"definitions.vehicles.{override}")
-
-
 def test_load_model_tells_the_same(mission: Path) -> None:
     spoil(mission, "seed: 0", "seed: zero")
     with pytest.raises(InputError, match=r"recon\.yaml:6 seed: is not a whole number"):

@@ -256,7 +256,7 @@ def test_names_that_are_none_are_refused(project: Path, line: str) -> None:
 
 OF_SETTINGS = {
     "needs = 5": "'needs' of the policy 'wrong.py:climb' must be a name or a tuple of names",
-    "needs = ('sorce',)": "'needs' of the policy 'wrong.py:climb' names 'sorce'",
+    "needs = ('sorce',)": "the policy 'wrong.py:climb' needs 'sorce', which is no thing that a mission finds",
     "needs = property(lambda self: 1 / 0)": "needed() of the policy 'wrong.py:climb' fails: wrong.py:7: ZeroDivision",
     "def needed(self): return None": "'needs' of the policy 'wrong.py:climb' must be a name or a tuple of names",
     "partners = ['altitude_m']": "'partners' of the policy 'wrong.py:climb' must be a mapping",
@@ -291,7 +291,7 @@ def test_settings_that_answer_with_what_is_none(project: Path, line: str, fragme
 
 OF_POLICY = {
     "vehicles = ()": "'vehicles' of the policy 'wrong.py:climb' is empty",
-    "vehicles = 'drone'": "'vehicles' of the policy 'wrong.py:climb' names 'drone'",
+    "vehicles = 'drone'": "the policy 'wrong.py:climb' commands 'drone', which is no kind of vehicle",
     "vehicles = property(lambda self: 1 / 0)": "vehicles of the policy 'wrong.py:climb' fails: wrong.py:11: Zero",
     "senses = property(lambda self: 1 / 0)": "senses of the policy 'wrong.py:climb' fails: wrong.py:11: Zero",
     "senses = 'imo'": "did you mean 'imu'?",
