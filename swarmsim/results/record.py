@@ -170,6 +170,15 @@ def carried_m(position_m: Floats, quaternion: Floats, offset_m: Floats | None) -
 
 
 @dataclass(frozen=True)
+class Departures:
+    """How far the truth of a mission departs from what it presumes (`swarmsim.config.mission.Knowledge`)."""
+
+    thickness_factor: Mapping[str, float]  # true over presumed thickness of what stands there, by material
+    sensitivity_factor: Mapping[str, float]  # true over presumed sensitivity, by detector model
+    pose_error_m: Mapping[str, Floats]  # [3] measured less true place (ENU), by vehicle with a detector
+
+
+@dataclass(frozen=True)
 class GammaConstant:
     """Dose rates 1 m from a source of 1 MBq with nothing around it."""
 
@@ -217,6 +226,7 @@ class MissionRecord:
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
     windows_kev: tuple[Window, ...] = ()  # energy windows of all detectors, lowest first
     at_1_m: Mapping[str, GammaConstant] = field(default_factory=dict)  # by nuclide, of those found and the true ones
+    departures: Departures | None = None  # None where no source was sought, which alone presumes anything
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

@@ -27,8 +27,10 @@ _SPECTRUM = (
 )
 _MISSIONS = (
     "missions of a batch, a row each: seed, status and finding; drawn_ what was drawn for it; PHASE_ what that phase "
-    "measured; survey_estimate_ and source_ the surest source after the survey and in the end, by all counts (std_ the "
-    "standard deviations, error_m the distance to the nearest true source); sources_found how many; nuclide and "
+    "measured; survey_estimate_ and source_ the surest source after the survey and in the end, by all counts (nuclide "
+    "that it was estimated as; std_ the standard deviations, covariance_ the covariances of the place, error_m the "
+    "distance to the nearest true source, true_nuclide that one's); true_thickness_factor_MATERIAL and "
+    "true_sensitivity_factor_DETECTOR true over presumed, as drawn for it; sources_found how many; nuclide and "
     "nuclide_confidence of the spectrum taken near it; success whether the answer is right and nothing went wrong"
 )
 
