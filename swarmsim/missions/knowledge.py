@@ -39,7 +39,7 @@ class Accumulated:
     """A spectrum summed over samples."""
 
     counts: jax.Array  # [channels]
-    live_s: jax.Array  # []
+    live_s: jax.Array  # [] real time of them, all of which is live: there is no dead time
     begin_s: jax.Array  # [] when the first of them began; inf without one
 
 

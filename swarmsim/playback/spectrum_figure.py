@@ -25,7 +25,7 @@ def spectrum_figure(spectrum: Spectrum) -> Figure:
     merge = max(1, len(spectrum.counts) // _BINS)
     energy = _merged(spectrum.energy_kev, merge) / merge
     counts, fit, background = (_merged(v, merge) for v in (spectrum.counts, spectrum.fit, spectrum.background))
-    measured = f"measured, {spectrum.live_time_s:.0f} s live"
+    measured = f"measured, {spectrum.live_time_s:.0f} s live time"
     upper.step(energy, counts, where="mid", color="0.35", linewidth=0.7, label=measured)
     upper.fill_between(energy, background, 0.1, step="mid", color="0.88", label="expected background")
     upper.plot(energy, fit, color=ESTIMATE, linewidth=1.0, label="fit")

@@ -18,12 +18,16 @@ _FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x 
 _MEASURED = (
     "detector samples; position is the crystal's (mean of the count), time the end of a count; counts_A_B_kev are the "
     "counts by energy window (the lowest and the highest window hold what lies beyond, null: the detector has no such "
-    "window); dose rates are ambient dose equivalent H*(10) and air kerma derived from the counts, background included"
+    "window); exposure_s is the real time that the counts stand for, dead time included (1 s of an idealised detector), "
+    "and count_rate_cps the counts over it; live_s is the live time, the exposure less the dead time by the detector's "
+    "law; dose rates are ambient dose equivalent H*(10) and air kerma by the counts over the live time, background "
+    "included"
 )
 _SPECTRUM = (
     "spectrum that the nuclide was identified by, summed over samples near the source (energy: centre of the channel) "
     "with the expected background and the fit; drawn by itself and without dead time: its total exceeds the samples' "
-    "counts by what the counter missed, and differs by statistics"
+    "counts by what the counter missed, and differs by statistics; live_time_s is the real time of its "
+    "samples, all of which is live"
 )
 _MISSIONS = (
     "missions of a batch, a row each: seed, status and finding; drawn_ what was drawn for it; PHASE_ what that phase "
