@@ -18,8 +18,8 @@ _FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x 
 _MEASURED = (
     "detector samples; position is the crystal's (mean of the count), time the end of a count; counts_A_B_kev are the "
     "counts by energy window (the lowest and the highest window hold what lies beyond, null: the detector has no such "
-    "window); exposure_s is the real time that the counts stand for, dead time included (1 s of an idealised detector), "
-    "and count_rate_cps the counts over it; live_s is the live time, the exposure less the dead time by the detector's "
+    "window); exposure_s is the real time that counts stand for, dead time included (1 s for an idealised one), and "
+    "count_rate_cps the counts over it; live_s is the live time, the exposure less the dead time by the detector's "
     "law; dose rates are ambient dose equivalent H*(10) and air kerma by the counts over the live time, background "
     "included"
 )
