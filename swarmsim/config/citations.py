@@ -63,9 +63,8 @@ def _roots(kind: str, data: dict[str, Any]) -> Iterator[Place]:
     if kind in _ROOTED:
         yield ()
         return
-    definitions = data.get("definitions")
-    for each in _ROOTED if isinstance(definitions, dict) else ():
-        named = definitions.get(each)
+    for each in _ROOTED:
+        named = item(item(data, "definitions"), each)
         yield from (("definitions", each, name) for name in (named if isinstance(named, dict) else ()))
 
 

@@ -16,18 +16,20 @@ from swarmsim.world.model import World
 
 
 def departures_of(simulation: Simulation, world: World, pose_std_m: np.ndarray | None, seed: int) -> Departures | None:
-    """The departures of the mission of a ``seed`` with its own ``world``; None where it presumes nothing.
+    """The departures of the mission of a ``seed`` with its own ``world``; None where no vehicle has a detector.
 
     They are drawn again, by the functions and from the key that the mission drew them with. ``pose_std_m`` [] is None
-    where it presumes nothing.
+    where no source is estimated, which alone asks for measured places.
     """
-    if pose_std_m is None:
+    counting = [np.asarray(group.member) for group in world.groups if group.counter is not None]
+    if not counting:
         return None
     members, models = simulation.scenario.members, detector_models(simulation.scenario)
-    counting = [np.asarray(group.member) for group in world.groups if group.counter is not None]
-    numbers = np.sort(np.concatenate(counting)).astype(np.int32)
+    measured = [] if pose_std_m is None else counting
+    numbers = np.sort(np.concatenate([np.zeros(0, np.int32), *measured])).astype(np.int32)
     key = randomness.mission_keys(np.array([seed]))[0]
-    drawn = _drawn(world.departures, key, jnp.asarray(pose_std_m), jnp.asarray(numbers), len(models))
+    std_m = jnp.zeros(()) if pose_std_m is None else jnp.asarray(pose_std_m)
+    drawn = _drawn(world.departures, key, std_m, jnp.asarray(numbers), len(models))
     lengths, sensitivities, errors = jax.device_get(drawn)
     site = world.site
     solid = np.all(np.asarray(site.obstacles.half_extent_m) > 0.0, axis=1)

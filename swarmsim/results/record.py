@@ -175,7 +175,9 @@ class Departures:
 
     thickness_factor: Mapping[str, float]  # true over presumed thickness of what stands there, by material
     sensitivity_factor: Mapping[str, float]  # true over presumed sensitivity, by detector model
-    pose_error_m: Mapping[str, Floats]  # [3] measured less true place (ENU), by vehicle with a detector
+    pose_error_m: Mapping[
+        str, Floats
+    ]  # [3] measured less true place (ENU), by vehicle; none where nothing is estimated
 
 
 @dataclass(frozen=True)
@@ -226,7 +228,7 @@ class MissionRecord:
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
     windows_kev: tuple[Window, ...] = ()  # energy windows of all detectors, lowest first
     at_1_m: Mapping[str, GammaConstant] = field(default_factory=dict)  # by nuclide, of those found and the true ones
-    departures: Departures | None = None  # None where no source was sought, which alone presumes anything
+    departures: Departures | None = None  # None where no vehicle has a detector
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

@@ -127,12 +127,12 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
 
 
 def departures_summary(record: MissionRecord) -> dict[str, dict[str, Any]] | None:
-    """Truth that was drawn for the mission, for validation; None where it sought no source.
+    """Truth that was drawn for the mission, for validation; None where no vehicle has a detector.
 
     ``thickness_factor``: true over presumed thickness, by material of the walls (none where walls are presumed exactly
     or not at all). ``sensitivity_factor``: true over presumed sensitivity, by detector model. ``pose_error_m``:
-    measured less true place (east, north, up) by vehicle, the same throughout; it is in what the estimate works on, and
-    not in the places of ``measurements.parquet``, which are true.
+    measured less true place (east, north, up) by vehicle, the same throughout; it is in what the estimate of sources
+    works on (none without one), and not in the places of ``measurements.parquet``, which are true.
     """
     made = record.departures
     if made is None:

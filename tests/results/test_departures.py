@@ -65,5 +65,10 @@ def test_the_sensitivity_is_what_counts_have(simulation):
         assert rates[0] / rates[1] == pytest.approx(made.sensitivity_factor[name], rel=1e-4)
 
 
-def test_a_mission_that_seeks_nothing_presumes_nothing(simulation):
-    assert departures_of(simulation, simulation.world, None, SEED) is None
+def test_without_an_estimate_there_are_no_measured_places(simulation):
+    made = departures_of(simulation, simulation.world, None, SEED)
+    assert made is not None
+    assert made.pose_error_m == {}
+    assert made.thickness_factor == departures(simulation).thickness_factor
+    bare = replace(simulation.world, groups=tuple(replace(g, counter=None) for g in simulation.world.groups))
+    assert departures_of(simulation, bare, None, SEED) is None
