@@ -55,7 +55,7 @@ class _Bars(RichBar):
         names, seconds = COMPILATIONS.under_way()
         if names:
             minutes, rest = divmod(int(seconds), 60)
-            text = f"compiling {', '.join(names)}: {minutes}:{rest:02d}; later runs load what is compiled now"
+            text = f"compiling for {minutes}:{rest:02d}: {', '.join(names)}; later runs load what is compiled now"
             yield Text(text, style="dim", overflow="ellipsis", no_wrap=True)
 
 

@@ -44,7 +44,7 @@ def test_it_says_what_is_being_compiled_and_for_how_long(terminal: bool, monkeyp
         before = screen.tell()
         progress._bar.refresh()
         assert "compiling" not in screen.getvalue()[before:]
-    assert ("compiling estimate, run: 1:15; later runs" in screen.getvalue()) == terminal
+    assert ("compiling for 1:15: estimate, run; later runs" in screen.getvalue()) == terminal
     assert screen.getvalue().count(COMPILING) == (0 if terminal else 1)
 
 
