@@ -1,7 +1,9 @@
 """What the README shows is run as it stands."""
 
 import re
+import shlex
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,7 @@ sources: [{nuclide: Co-60, position_m: [-190, 60], height_m: 0.5, activity_mbq: 
 vehicles: [{name: uav, type: tarot_t650, position_m: [-190, 0]}]
 phases: [{name: climb, who: uav, policy: "climb.py:Climb", settings: {height_m: 12}, time_limit_s: 120}]
 """
+SWEEP = next(text for text in PYTHON if "swarmsim.run(" in text)
 CONFIGURATIONS = {"nuclides": "Y-88", "detectors": "nai_1x1", "vehicles": "heavy_t650"}
 
 
@@ -40,7 +43,8 @@ def test_the_python_example_flies_and_steps(capsys, tmp_path, monkeypatch):
 
 
 def test_the_policy_example_climbs_towards_the_source(tmp_path):
-    (tmp_path / "climb.py").write_text(PYTHON[1], encoding="utf-8")
+    policy = next(text for text in PYTHON if "class Climb" in text)
+    (tmp_path / "climb.py").write_text(policy, encoding="utf-8")
     mission = tmp_path / "climb.yaml"
     mission.write_text(CLIMBING, encoding="utf-8")
     simulation = swarmsim.build(swarmsim.load(mission))
@@ -51,6 +55,26 @@ def test_the_policy_example_climbs_towards_the_source(tmp_path):
         assert not record.vehicles[0].crashed
         ends.append(np.linalg.norm(record.vehicles[0].position_m[-1, :2] - record.sources[0].position_m[:2]))
     assert np.median(ends) < 25.0  # from 60 m away
+
+
+def test_the_sweep_runs_a_scenario_for_each_value(monkeypatch):
+    ran = {}
+
+    def run(scenario, out, missions):
+        ran[out] = (scenario.mission.knowledge.pose_std_m, missions)
+        return ()
+
+    monkeypatch.setattr(swarmsim, "run", run)
+    exec(compile(SWEEP, str(README), "exec"), {})
+    assert ran == {f"runs/pose_{std}": (std, 2) for std in (0.02, 0.1, 0.5)}
+
+
+def test_the_study_of_dead_time_is_read():
+    shown = next(text for language, text in BLOCKS if language == "sh" and "dead_time" in text)
+    _, _, name, *options = shlex.split(shown.replace("\\\n", " "))
+    scenario = load_scenario(name, [value for option, value in pairwise(options) if option == "--set"])
+    assert scenario.detectors["nai_2x2"].dead_time.paralyzable_us == 10.0
+    assert [varied.path for varied in scenario.family] == ["sources.0.activity_mbq"]
 
 
 def test_the_phases_shown_are_read(tmp_path):

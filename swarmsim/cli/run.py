@@ -29,6 +29,7 @@ _FOUND_ROWS = (
     ("Source, standard deviation", "source.position_std_m", "m"),
     ("Source error", "source.error_m", "m"),
     ("Activity", "source.activity_mbq", "MBq"),
+    ("Activity, standard deviation", "source.activity_std_mbq", "MBq"),
     ("Activity error", "source.activity_error_percent", "%"),
     ("Dose rate 1 m from the source", "source.dose_rate_1m_usv_h", "uSv/h"),
     ("Dose rate, standard deviation", "source.dose_rate_1m_std_usv_h", "uSv/h"),

@@ -1,5 +1,6 @@
 """YAML files to validated models: composition with ``extends``, overrides, and one error that says all."""
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 from swarmsim.config import files
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.catalogue import MODELS, kind_of_model
+from swarmsim.config.citations import restate
 from swarmsim.config.documents import Document, Place, read_file
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.names import did_you_mean, one_of
@@ -101,7 +103,9 @@ def _extended(path: Path, kind: str | None, chain: tuple[Path, ...]) -> Document
     merged.marks[()] = document.marks[()]
     document.data.pop("extends")
     replaced: dict[Place, Place] = {}
+    before = copy.deepcopy(base.data)
     _merge(merged, document, merged.data, document.data, (), (), replaced)
+    restate(kind, merged.data, before, document.data, replaced, path.name)
     _take_marks(merged, document, replaced)
     return merged
 

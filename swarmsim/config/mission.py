@@ -160,15 +160,17 @@ class Knowledge(Model):
 
     ``site``: ``exact``; ``geometry``, with walls up to ``thickness_share`` thinner or thicker than presumed, alike for
     all of a material, and standing within ``geometry_std_m`` of where they are presumed; ``terrain``, without anything
-    that stands on it; ``none``, a plane. Measured places are off by ``pose_std_m`` for each vehicle (RTK), the
-    sensitivity of a detector model by ``sensitivity_std``. ``nuclides`` are those in question. ``background_std`` is
-    how much a background may differ from one window to the next, ``model_std`` what is presumed of errors of the model
-    of the rates in a window, and ``spectrum_std`` of each region of its spectrum beside that, all as standard
-    deviations of logarithms. Errors of the model are alike in neighbouring windows, so that all of them together tell
-    less of a place than if each had its own: in the posterior the logarithm of the likelihood counts ``learning_rate``
-    times. The activity of a source is presumed to be ``activity_mbq``, give or take a factor of ``activity_factor``
-    (one standard deviation of its logarithm), which decides where counts allow for a hundred megabecquerels of one
-    nuclide or a terabecquerel of another.
+    that stands on it; ``none``, a plane. It limits the estimate alone: paths and routes are planned on the true site.
+    Measured places are off by ``pose_std_m`` for each vehicle (RTK), the sensitivity of a detector model by
+    ``sensitivity_std``. ``nuclides`` are those that the estimate considers; identification weighs the whole library.
+    The level of the background over its nominal rate is fitted for each detector model, with a flat prior of its
+    logarithm. ``background_std`` is how much a background may differ from one window to the next, ``model_std`` what is
+    presumed of errors of the model of the rates in a window, and ``spectrum_std`` of each region of its spectrum beside
+    that, all as standard deviations of logarithms. Errors of the model are alike in neighbouring windows, so that all
+    of them together tell less of a place than if each had its own: in the posterior the logarithm of the likelihood
+    counts ``learning_rate`` times. The activity of a source is presumed to be ``activity_mbq``, give or take a factor
+    of ``activity_factor`` (one standard deviation of its logarithm), which decides where counts allow for a hundred
+    megabecquerels of one nuclide or a terabecquerel of another.
     """
 
     site: Literal["exact", "geometry", "terrain", "none"] = "geometry"

@@ -1,10 +1,12 @@
 """Dotted overrides from the command line: ``wind.speed_m_s=3``, ``phases.survey.settings.altitude_m=30``."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from swarmsim.config.allowed import Shape
+from swarmsim.config.citations import restate
 from swarmsim.config.documents import Document, Mark, Place, dotted, parse_value
 from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.former import former_override
@@ -12,6 +14,7 @@ from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.vary import DISTRIBUTIONS
 
 ORIGIN = "--set"
+_CITING = "definitions"  # of the parts of a mission, those whose values have sources
 
 
 def apply_overrides(document: Document, overrides: Sequence[str], shape: Shape, origin: str = ORIGIN) -> None:
@@ -22,16 +25,34 @@ def apply_overrides(document: Document, overrides: Sequence[str], shape: Shape, 
     A list's items are named by index, or by their ``name`` field (``vehicles.uav1.heading_deg=90``); values are YAML.
     """
     problems: list[Problem] = []
+    places: list[Place] = []
+    before = copy.deepcopy(document.data) if any(text.strip().startswith(_CITING) for text in overrides) else {}
     for text in overrides:
         try:
-            _apply(document, text, shape, origin)
+            places.append(_apply(document, text, shape, origin))
         except InputError as error:
             problems += [replace(problem, file=origin) for problem in error.problems]
     if problems:
         raise InputError(problems)
+    if before:
+        restate("missions", document.data, before, _own_sources(places), places, ORIGIN)
 
 
-def _apply(document: Document, text: str, shape: Shape, origin: str) -> None:
+def _own_sources(places: Sequence[Place]) -> dict[str, Any]:
+    """The sources among what overrides set, laid out as in a mission."""
+    own: dict[str, Any] = {_CITING: {}}
+    for place in places:
+        if len(place) > 3 and place[3] in ("source", "sources"):
+            given = own[_CITING].setdefault(place[1], {}).setdefault(place[2], {})
+            if place[3] == "source":
+                given["source"] = ORIGIN
+            else:
+                given.setdefault("sources", {})[dotted(place[4:])] = ORIGIN
+    return own
+
+
+def _apply(document: Document, text: str, shape: Shape, origin: str) -> Place:
+    """Set one; returns its place."""
     path, equals, value_text = text.partition("=")
     steps = path.strip().split(".")
     if not equals or not all(steps):
@@ -58,6 +79,7 @@ def _apply(document: Document, text: str, shape: Shape, origin: str) -> None:
                 node[known] = {}
             node = node[known]
     document.replace(place, {place: Mark(origin, None)})
+    return place
 
 
 def _with_whole_path(steps: list[str]) -> list[str]:

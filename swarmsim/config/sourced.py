@@ -23,7 +23,8 @@ def _numeric_paths(value: Any, path: str = "") -> Iterator[str]:
 class Sourced(Model):
     """A model whose every number has its source in ``sources``: dotted path to where the number is from.
 
-    A path covers its children: ``rotor`` covers ``rotor.radius_m``, ``rotors`` covers ``rotors.0.position_m.2``.
+    A path covers its children: ``rotor`` covers ``rotor.radius_m``, ``rotors`` covers ``rotors.0.position_m.2``. Of a
+    value that a file changes in what it extends, the inherited source does not hold (`swarmsim.config.citations`).
     """
 
     sources: dict[str, str]

@@ -39,7 +39,7 @@ class Accumulated:
     """A spectrum summed over samples."""
 
     counts: jax.Array  # [channels]
-    live_s: jax.Array  # []
+    live_s: jax.Array  # [] real time of them, all of which is live: there is no dead time
     begin_s: jax.Array  # [] when the first of them began; inf without one
 
 
@@ -68,13 +68,19 @@ def gathered(
         if held is None or group.counter is None:
             continue
         few = merged(held, kept)
-        keys = randomness.per_vehicle(randomness.consumer(key, "pose"), jnp.int32(0), jnp.asarray(group.member))
-        off = plan.presumed.pose_std_m * jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
+        off = pose_errors(plan.presumed.pose_std_m, key, jnp.asarray(group.member))
         shifted = few.position_m + few.exposure_s[..., None] * off[:, None]
         few = replace(few, position_m=shifted, begin_m=few.begin_m + off[:, None])
         parts.append(measured(few, group.counter.index))
         groups.append((parts[-1].counts.shape[0], group.counter.index, plan.localisation.rays))
     return concatenate(*parts), spans_of(groups)
+
+
+def pose_errors(std_m: jax.Array, key: jax.Array, member: jax.Array) -> jax.Array:
+    """Measured less true place [U, 3] (ENU, m) of the vehicles numbered ``member`` [U], in the mission of ``key``."""
+    keys = randomness.per_vehicle(randomness.consumer(key, "pose"), jnp.int32(0), member)
+    errors: jax.Array = std_m * jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
+    return errors
 
 
 @pytree

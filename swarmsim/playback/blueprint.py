@@ -185,7 +185,7 @@ def _spectrum(record: MissionRecord) -> rrb.View:
         return rrb.TextDocumentView(origin="spectrum", name="Spectrum")
     return rrb.BarChartView(
         origin="spectrum",
-        name=f"Spectrum (counts against keV), {record.spectrum.live_time_s:.0f} s live",
+        name=f"Spectrum (counts against keV), {record.spectrum.live_time_s:.0f} s live time",
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
     )
 

@@ -12,12 +12,13 @@ from swarmsim.results.record import MissionRecord, Phase, Samples, VehicleRecord
 
 # Okabe & Ito (2008), "Color universal design", without its black and its yellow (too pale on paper).
 _FLYING = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9")
-_DRIVING = ("#D55E00", "#8A3700", "#F2A36B")  # its vermilion, darker and lighter
-TRUTH = "#D55E00"
+_DRIVING = ("#8A3700", "#F2A36B", "#4D4D4D")  # its vermilion, darker and lighter, and grey
+TRUTH = "#D55E00"  # its vermilion, which no vehicle has
 ESTIMATE = "#0072B2"
 RATE_MAP = "viridis"
 FLOWN, DRIVEN = "flown", "driven"
 """Colour scales of count rates, by how the phase moves that they were measured in."""
+PAD_M = 3.0  # around where a track begins or ends
 
 
 def vehicle_colours(record: MissionRecord) -> list[str]:
@@ -90,6 +91,20 @@ def smoothed_rate(samples: Samples, window_s: float = 1.0) -> NDArray[np.floatin
     return rate
 
 
+def away_from_pads(record: MissionRecord, samples: Samples) -> NDArray[np.bool_]:
+    """Which samples [n] were not taken above the place where their vehicle starts or ends; all where none were.
+
+    There a vehicle counts for long and at every height. The ground is near, so that without a strong source the rates
+    of starts and landings would set the scale of a survey.
+    """
+    away = np.ones(len(samples.time_s), bool)
+    for number in np.unique(samples.vehicle):
+        mine, track = samples.vehicle == number, record.vehicles[number].position_m
+        for pad in track[[0, -1], :2] if len(track) else ():
+            away[mine] &= np.linalg.norm(samples.position_m[mine, :2] - pad, axis=1) > PAD_M
+    return away if away.any() else np.ones_like(away)
+
+
 def measured_phases(record: MissionRecord) -> list[Phase]:
     """The phases in which something was measured."""
     measured = set(record.samples.phase.tolist())
@@ -111,6 +126,10 @@ def rate_scales(record: MissionRecord) -> dict[str, RateScale]:
     if record.map is not None:
         rates[FLOWN].append(record.map.mean_cps.reshape(-1))
     for phase in measured_phases(record):
-        rates[scale_name(record, phase)].append(smoothed_rate(record.samples.of_phase(phase.name)))
+        samples = record.samples.of_phase(phase.name)
+        name = scale_name(record, phase)
+        if name == FLOWN:
+            samples = samples.rows(away_from_pads(record, samples))
+        rates[name].append(smoothed_rate(samples))
     made = {FLOWN: linear_scale, DRIVEN: log_scale}
     return {name: made[name](np.concatenate(values)) for name, values in rates.items() if values}

@@ -16,12 +16,19 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from swarmsim.playback import plan
-from swarmsim.playback.colours import RATE_MAP, linear_scale, log_scale, measured_phases, smoothed_rate, vehicle_colours
+from swarmsim.playback.colours import (
+    RATE_MAP,
+    away_from_pads,
+    linear_scale,
+    log_scale,
+    measured_phases,
+    smoothed_rate,
+    vehicle_colours,
+)
 from swarmsim.playback.entities import is_large
 from swarmsim.playback.spectrum_figure import spectrum_figure
 from swarmsim.results.record import Estimate, MissionRecord, Phase, RadiationMap
@@ -67,7 +74,7 @@ def trajectories(record: MissionRecord, site_model: SiteModel) -> Figure:
     """Paths of all vehicles over the site plan; a large team is named by its types."""
     large = is_large(record)
     entries = 3 + (len({v.type for v in record.vehicles}) if large else len(record.vehicles))
-    figure, axes = plan.new_plan(site_model, legend_height_in=0.2 + 0.14 * -(-entries // _TRACK_COLUMNS))
+    figure, axes = plan.new_plan(site_model, legend_height_in=0.2 + 0.14 * -(-entries // _TRACK_COLUMNS), bar=False)
     points = max(2, _TRACK_POINTS_MAX // max(1, len(record.vehicles)))
     width = 0.4 if large else 0.9
     for vehicle, colour in zip(record.vehicles, vehicle_colours(record), strict=True):
@@ -92,15 +99,16 @@ def trajectories(record: MissionRecord, site_model: SiteModel) -> Figure:
 
 
 def flown_measurements(phase: Phase, record: MissionRecord, site_model: SiteModel) -> Figure:
-    """Count rates of a phase that was flown, where they were measured."""
+    """Count rates of a phase that was flown, where they were measured; those above the pads do not set the scale."""
     figure, axes = plan.new_plan(site_model)
     samples = record.samples.of_phase(phase.name)
     rate = smoothed_rate(samples)
-    scale = linear_scale(rate)
+    scale = linear_scale(smoothed_rate(samples.rows(away_from_pads(record, samples))))
     x, y, _ = samples.position_m.T
     dots = axes.scatter(x, y, c=rate, s=2.2, cmap=RATE_MAP, norm=scale.norm, linewidths=0, zorder=4, rasterized=True)
     plan.draw_truth(axes, record)
-    plan.colour_bar(figure, axes, dots, _RATE_LABEL)
+    beyond = bool(np.any(rate > scale.limits_cps[1]))
+    plan.colour_bar(figure, axes, dots, _RATE_LABEL, extend="max" if beyond else "neither")
     handles, _ = axes.get_legend_handles_labels()
     plan.legend_above(axes, 2, [*handles, plan.building_patch()])
     return figure
@@ -114,13 +122,14 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
     figure, whole, close = plan.new_pair(site_model, centre, half)
     for axes in (whole, close):
         image = _draw_map(axes, made)
-        _outline_buildings(axes, site_model)
+        plan.outline_site(axes, site_model)
         if len(made.hotspots_m):
             axes.plot(*made.hotspots_m.T, linestyle="none", marker="o", markersize=9.0, markerfacecolor="none",
                       markeredgecolor="black", markeredgewidth=1.0, label="hotspot", zorder=6)  # fmt: skip
         plan.draw_truth(axes, record)
         plan.draw_estimate(axes, record.survey_estimate, "survey estimate, 95 % ellipse")
-    plan.colour_bar(figure, close, image, f"Count rate, interpolated, $\\pm$ {np.median(made.std_cps):.2g} [1/s]")
+    std = f"median standard deviation {np.median(made.std_cps):.2g}"
+    plan.colour_bar(figure, close, image, f"Count rate, interpolated [1/s]\n({std})")
     handles, _ = whole.get_legend_handles_labels()
     plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="obstacles")])
     return figure
@@ -144,17 +153,6 @@ def _draw_map(axes: Axes, made: RadiationMap) -> AxesImage:
     axes.set_xlim(limits[0])
     axes.set_ylim(limits[1])
     return image
-
-
-def _outline_buildings(axes: Axes, site_model: SiteModel) -> None:
-    site = site_model.site
-    above = np.asarray(site.surface_m, float) - np.asarray(site.terrain_m, float)
-    if above.max() <= plan.BUILDING_MIN_HEIGHT_M:
-        return
-    cell, origin = float(site.cell_m), np.asarray(site.origin_m, float)
-    x, y = origin[0] + cell * np.arange(above.shape[1]), origin[1] + cell * np.arange(above.shape[0])
-    outline = axes.contour(x, y, above, levels=[plan.BUILDING_MIN_HEIGHT_M], colors="black", linewidths=0.5, zorder=3)
-    outline.set_path_effects([withStroke(linewidth=1.3, foreground="white")])  # seen on the dark and on the bright end
 
 
 def driven_measurements(phase: Phase, record: MissionRecord, site_model: SiteModel) -> Figure:

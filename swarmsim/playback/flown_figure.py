@@ -16,7 +16,7 @@ from swarmsim.site.model import SiteModel
 
 NAME = "flown"
 _HEIGHT_IN = 3.25
-_LEFT, _RIGHT = (0.075, 0.125, 0.395, 0.72), (0.575, 0.41)  # left, bottom, width, height; left, width
+_LEFT, _RIGHT = (0.09, 0.125, 0.38, 0.72), (0.575, 0.405)  # left, bottom, width, height; left, width
 _MARGIN = 0.08  # of the larger side around the tracks
 _LEAST_M = 10.0
 _POINTS = 4000  # of a line
@@ -92,7 +92,7 @@ def _draw_errors(axes: Axes, overlay: Overlay) -> None:
         told = statistics(values)
         if told is not None:
             axes.plot(made.time_s, values, "-", color=colour, linewidth=0.8, label=f"{what}, rms {told['rms_m']:.2f} m")
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, 1.05 * axes.dataLim.y1 if axes.dataLim.y1 > 0.0 else None)  # one that is constant is seen
     axes.set_ylabel("Horizontal error [m]")
     axes.grid(color="0.9", linewidth=0.5)
     axes.set_axisbelow(True)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib
 import numpy as np
@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Patch
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from swarmsim.playback.colours import ESTIMATE, TRUTH
@@ -68,10 +69,13 @@ def site_extent(site_model: SiteModel) -> tuple[float, float, float, float]:
     return x, x + nx * cell, y, y + ny * cell
 
 
-def new_plan(site_model: SiteModel, legend_height_in: float = 0.45) -> tuple[Figure, Axes]:
-    """A single-column figure whose axes show the whole site to scale, with room for a legend above and a bar beside."""
+def new_plan(site_model: SiteModel, legend_height_in: float = 0.32, bar: bool = True) -> tuple[Figure, Axes]:
+    """A single-column figure whose axes show the whole site to scale, with room for a legend above.
+
+    With ``bar`` there is room for a colour bar beside them.
+    """
     west, east, south, north = site_extent(site_model)
-    left, right, bottom = 0.53, 0.66, 0.38
+    left, right, bottom = 0.53, 0.66 if bar else 0.1, 0.38
     width = SINGLE_COLUMN_IN - left - right
     height = min(width * (north - south) / (east - west), 1.6 * width)
     total = bottom + height + legend_height_in
@@ -96,9 +100,18 @@ def new_pair(site_model: SiteModel, centre_m: NDArray[np.floating], half_m: floa
     close.set_xlim(centre_m[0] - half_m, centre_m[0] + half_m)
     close.set_ylim(centre_m[1] - half_m, centre_m[1] + half_m)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half_m + centre_m
-    whole.plot(*corners.T, color="black", linewidth=0.7, zorder=6)
-    whole.text(corners[3, 0], corners[3, 1] + 0.01 * (north - south), "close-up", fontsize=7.0, va="bottom", zorder=6)
+    (frame,) = whole.plot(*corners.T, color="black", linewidth=0.7, zorder=6)
+    frame.set_path_effects([halo(0.7)])
+    name = whole.annotate(
+        "close-up", corners[3], xytext=(0, 2), textcoords="offset points", fontsize=7.0, va="bottom", zorder=9
+    )
+    name.set_path_effects([halo(1.0)])
     return figure, whole, close
+
+
+def halo(linewidth: float) -> withStroke:
+    """A white rim about a line of this width or a text, so that it is seen on the dark and on the bright end."""
+    return withStroke(linewidth=linewidth + 0.9, foreground="white")
 
 
 def _seen_from_above(site_model: SiteModel) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
@@ -120,6 +133,17 @@ def _seen_from_above(site_model: SiteModel) -> tuple[NDArray[np.floating], NDArr
     return corners[order], above[order]
 
 
+def _within_another(number: int, corners: NDArray[np.floating]) -> bool:
+    """Whether rectangle ``number`` of ``corners`` [k, 4, 2] lies within another; of equal ones the first does not."""
+    sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]], axis=1)  # [k, 2, 2]
+    lengths = np.sum(sides * sides, axis=2)
+    share = np.einsum("kij,klj->kil", corners[number] - corners[:, :1], sides) / lengths[:, None]
+    around = np.all((share > -1e-4) & (share < 1.0 + 1e-4), axis=(1, 2))
+    area = np.sqrt(np.prod(lengths, axis=1))
+    larger = (area > area[number] * (1.0 + 1e-3)) | (np.arange(len(corners)) < number)
+    return bool(np.any(around & larger))
+
+
 def draw_site(axes: Axes, site_model: SiteModel) -> None:
     """Buildings and other tall things in grey, the taller the darker; scale equal, north up."""
     corners, above = _seen_from_above(site_model)
@@ -130,22 +154,30 @@ def draw_site(axes: Axes, site_model: SiteModel) -> None:
     frame_axes(axes)
 
 
+def outline_site(axes: Axes, site_model: SiteModel) -> None:
+    """Outlines of what `draw_site` fills, over an image; without the boxes that lie within another one."""
+    corners, _ = _seen_from_above(site_model)
+    outer = [box for number, box in enumerate(corners) if not _within_another(number, corners)]
+    shapes = PolyCollection(outer, facecolors="none", edgecolors="black", linewidths=0.5, zorder=3)
+    shapes.set_path_effects([halo(0.2)])
+    axes.add_collection(shapes)
+
+
 def frame_axes(axes: Axes) -> None:
-    """Scale equal, north up, with an arrow that says so."""
+    """Scale equal, north up, with an arrow that says so in the corner that the two axes' labels leave free."""
     axes.set_aspect("equal")
     axes.set_xlabel("East [m]")
     axes.set_ylabel("North [m]")
     axes.annotate(
         "N",
-        xy=(0.955, 0.965),
-        xytext=(0.955, 0.855),
-        xycoords="axes fraction",
+        xy=(-17.0, -5.0),
+        xytext=(-17.0, -21.0),
+        xycoords="axes points",
         ha="center",
         va="center",
         fontsize=7.5,
-        bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
         arrowprops={"arrowstyle": "-|>", "color": "black", "linewidth": 0.8, "shrinkA": 1, "shrinkB": 0},
-        zorder=9,
+        annotation_clip=False,
     )
 
 
@@ -154,12 +186,14 @@ def building_patch() -> Patch:
     return Patch(facecolor="0.7", edgecolor="none", label="obstacles")
 
 
-def colour_bar(figure: Figure, axes: Axes, mappable: object, label: str) -> Axes:
-    """A slim colour bar along the right of ``axes``, as high as they are."""
+def colour_bar(
+    figure: Figure, axes: Axes, mappable: object, label: str, extend: Literal["neither", "max"] = "neither"
+) -> Axes:
+    """A slim colour bar along the right of ``axes``, as high as they are; with an arrow where values exceed it."""
     axes.apply_aspect()
     box = axes.get_position()
     bar_axes = figure.add_axes((box.x1 + 0.08 / figure.get_figwidth(), box.y0, 0.1 / figure.get_figwidth(), box.height))
-    bar = figure.colorbar(mappable, cax=bar_axes)  # type: ignore[arg-type]
+    bar = figure.colorbar(mappable, cax=bar_axes, extend=extend)  # type: ignore[arg-type]
     bar.set_label(label)
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
     return bar_axes

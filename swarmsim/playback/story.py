@@ -29,7 +29,7 @@ def story(record: MissionRecord) -> list[tuple[float, str, str]]:
     lines += [(end, "INFO", f"final estimate: {describe(one)}") for one in record.estimates]
     if record.spectrum is not None:
         named = spectrum_title(record.spectrum)
-        lines.append((end, "INFO", f"spectrum of {record.spectrum.live_time_s:.0f} s live: {named}"))
+        lines.append((end, "INFO", f"spectrum of {record.spectrum.live_time_s:.0f} s live time: {named}"))
     lines += [(end, "WARN", warning) for warning in record.warnings]
     lines.append((end, "INFO", record.finding))
     return sorted(lines, key=lambda line: line[0])

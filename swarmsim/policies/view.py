@@ -19,7 +19,7 @@ class Task:
     """What a vehicle is to do in a phase."""
 
     settings: Any  # numbers of the phase's settings, as an object with their names
-    site: Site  # the mission's knowledge of the site, shared by all vehicles
+    site: Site  # the true one, whatever `knowledge.site` is; shared by all vehicles
     home_m: jax.Array  # [2] where the vehicle started the mission, world
     yaw_rad: jax.Array  # [] its heading then, counter-clockwise from east
     params: Any  # its own parameters, e.g. ``params.control.speed_max_m_s``

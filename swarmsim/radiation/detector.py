@@ -68,7 +68,7 @@ class Detector:
     background_height_m: jax.Array  # [] above ground, where it is that
     paralyzable_s: jax.Array  # []
     non_paralyzable_s: jax.Array  # []
-    sample_period_s: jax.Array  # [] live time of one measurement
+    sample_period_s: jax.Array  # [] real time of one measurement, dead time included
     yields: jax.Array  # [N, L] photons per decay
     effective_area_m2: jax.Array  # [N, L, 5] coefficients of cylinder.direction_basis, housing and threshold included
     near: jax.Array  # [NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS] of cylinder.near_ratio

@@ -193,20 +193,20 @@ def saturating_rate(paralyzable_s: float, non_paralyzable_s: float) -> float:
     return float(1.0 / b if a == 0.0 else (-b + np.sqrt(b * b + 4.0 * a)) / (2.0 * a))
 
 
-def exposure_of(detector: Detector, live_s: jax.Array | float) -> jax.Array:
-    """Exposure [] in s that the counts of a live time of ``live_s`` [] stand for.
+def exposure_of(detector: Detector, period_s: jax.Array | float) -> jax.Array:
+    """Exposure [] in s that the counts of a measurement over ``period_s`` [] stand for: real time, dead time included.
 
-    ``physical``: the live time. ``paper_ideal``: as of the Gazebo plugin, whose every message represents one second
+    ``physical``: the period. ``paper_ideal``: as of the Gazebo plugin, whose every message represents one second
     whatever the message rate.
     """
-    return jnp.asarray(live_s if detector.kind == "physical" else 1.0, jnp.float32)
+    return jnp.asarray(period_s if detector.kind == "physical" else 1.0, jnp.float32)
 
 
 def draw_counts(
-    detector: Detector, key: jax.Array, mean_observed_cps: jax.Array, live_s: jax.Array
+    detector: Detector, key: jax.Array, mean_observed_cps: jax.Array, period_s: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Counts [...] of one measurement and the exposure [] in s that they represent: Poisson(rate x exposure)."""
-    exposure, mean = exposure_of(detector, live_s), jnp.asarray(mean_observed_cps)
+    exposure, mean = exposure_of(detector, period_s), jnp.asarray(mean_observed_cps)
     if mean.ndim == 0:
         return poisson(key, mean * exposure), exposure
     keys = jax.random.split(key, mean.shape[0])

@@ -11,6 +11,7 @@ from swarmsim.missions.state import MissionState
 from swarmsim.radiation.dose import gamma_constant
 from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.radiation.rate import highest_rate
+from swarmsim.results.departures import departures_of
 from swarmsim.results.finding import NO_SPECTRUM, NO_WAY, finding
 from swarmsim.results.record import (
     Estimate,
@@ -60,7 +61,9 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         surveyed = _estimates(conclusion.survey.estimated, nuclides)
         final = _estimates(conclusion.estimated, nuclides)
         spectrum = _spectrum(simulation, conclusion)
-    sources = true_sources(simulation, batch.worlds.of(index), vehicles)
+    world = batch.worlds.of(index)
+    pose_std_m = batch.plans.part(index, lambda plan: None if plan.presumed is None else plan.presumed.pose_std_m)
+    sources = true_sources(simulation, world, vehicles)
     samples = _samples(simulation, batch, index, phases)
     chart = None if conclusion is None else _map(simulation, conclusion.survey)
     verdict = None
@@ -92,6 +95,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         drawn=batch.draws.told(index),
         windows_kev=windows_of(simulation),
         at_1_m=gamma_constants(simulation, (*surveyed, *final, *sources)),
+        departures=departures_of(simulation, world, pose_std_m, int(batch.seeds[index])),
     )
 
 

@@ -57,13 +57,22 @@ def _placed(estimate: Estimate) -> str:
     (xx, xy), (_, yy) = np.asarray(estimate.covariance_m2, float)[:2, :2]
     std = math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))
     digits = 1 if std >= 0.095 else 2
-    placed = f"{in_mbq(estimate.activity_mbq)} {estimate.nuclide} at ({x:.{digits}f}, {y:.{digits}f}) ± {std:.2g} m"
+    placed = f"{_activity(estimate)} {estimate.nuclide} at ({x:.{digits}f}, {y:.{digits}f}) ± {std:.2g} m"
     if estimate.joined_m > 0.0:
         return f"{placed} (or several within {math.ceil(estimate.joined_m)} m, or behind other walls than presumed)"
     another = f"another {estimate.nuclide} source {ONE_M:g} to {COMPANION_M:g} m off"
     if not math.isfinite(estimate.beside_mbq):
         return f"{placed} ({another} may go unnoticed whatever its activity)"
     return f"{placed} ({another} would be noticed from {in_mbq(estimate.beside_mbq)} on)"
+
+
+def _activity(estimate: Estimate) -> str:
+    """The activity and one standard deviation of it, both to the second digit of the latter."""
+    value, std = estimate.activity_mbq, estimate.activity_std_mbq
+    if not (math.isfinite(std) and std > 0.0):
+        return in_mbq(value)
+    digits = max(0, 1 - math.floor(math.log10(std)))
+    return f"{value:.{digits}f} ± {std:.{digits}f} MBq"
 
 
 def _surest(estimate: Estimate, spectrum: Spectrum | None, hindrance: str | None, by: str) -> str:

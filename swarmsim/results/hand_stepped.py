@@ -14,6 +14,7 @@ import numpy as np
 
 from swarmsim.missions.state import Track
 from swarmsim.pytree import pytree
+from swarmsim.results.departures import departures_of
 from swarmsim.results.extract import CROWDED, gamma_constants
 from swarmsim.results.record import Event, MissionRecord, Phase, VehicleRecord
 from swarmsim.results.samples import READ, measured_rows, samples_of, windows_of
@@ -117,6 +118,7 @@ def record_steps(simulation: Simulation, frames: Frame, seed: int, world: World 
         drawn=simulation.draws.told(0) if world is None else {},
         windows_kev=windows_of(simulation),
         at_1_m=gamma_constants(simulation, sources),
+        departures=departures_of(simulation, simulation.world if world is None else world, None, seed),
     )
 
 

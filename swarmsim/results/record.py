@@ -70,11 +70,11 @@ class Samples:
     time_s: Floats  # [n] end of the counting interval
     position_m: Floats  # [n, 3] of the crystal
     counts: Floats  # [n]
-    exposure_s: Floats  # [n] live interval that the counts stand for
-    count_rate_cps: Floats  # [n] counts / exposure
+    exposure_s: Floats  # [n] real time that the counts stand for, dead time included
+    count_rate_cps: Floats  # [n] counts / exposure, not corrected for dead time
     axis: Floats | None = None  # [n, 3] unit vector along the crystal, mean, world; None, as all below: not recorded
     windows: Floats | None = None  # [n, W] counts by `MissionRecord.windows_kev`, nan: not of this detector
-    live_s: Floats | None = None  # [n] part of the exposure in which the detector was not dead, by its law
+    live_s: Floats | None = None  # [n] live time: the exposure less the dead time, by the detector's law
     dose_rate_usv_h: Floats | None = None  # [n] H*(10) by the counts (`DoseOperator`), natural background included
     dose_rate_std_usv_h: Floats | None = None  # [n] its standard deviation by counting statistics
     kerma_rate_ugy_h: Floats | None = None  # [n] air kerma rate by the counts
@@ -131,9 +131,9 @@ class Spectrum:
 
     energy_kev: Floats  # [c] channel centres
     counts: Floats  # [c]
-    background: Floats  # [c] expected background counts in the same live time
+    background: Floats  # [c] expected background counts in the live time
     fit: Floats  # [c] fitted counts of the best nuclide plus background
-    live_time_s: float
+    live_time_s: float  # real time of its samples, all of which is live: it is drawn without dead time
     nuclide: str  # "none" where the background explains the counts, "unknown" where no nuclide of the library does
     confidence: float  # of that answer
     scores: dict[str, float]  # posterior of every candidate nuclide
@@ -167,6 +167,17 @@ def carried_m(position_m: Floats, quaternion: Floats, offset_m: Floats | None) -
     turn = np.asarray(quaternion, float)
     twice = 2.0 * np.cross(turn[:, 1:], offset_m)
     return place + offset_m + turn[:, :1] * twice + np.cross(turn[:, 1:], twice)
+
+
+@dataclass(frozen=True)
+class Departures:
+    """How far the truth of a mission departs from what it presumes (`swarmsim.config.mission.Knowledge`)."""
+
+    thickness_factor: Mapping[str, float]  # true over presumed thickness of what stands there, by material
+    sensitivity_factor: Mapping[str, float]  # true over presumed sensitivity, by detector model
+    pose_error_m: Mapping[
+        str, Floats
+    ]  # [3] measured less true place (ENU), by vehicle; none where nothing is estimated
 
 
 @dataclass(frozen=True)
@@ -217,6 +228,7 @@ class MissionRecord:
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
     windows_kev: tuple[Window, ...] = ()  # energy windows of all detectors, lowest first
     at_1_m: Mapping[str, GammaConstant] = field(default_factory=dict)  # by nuclide, of those found and the true ones
+    departures: Departures | None = None  # None where no vehicle has a detector
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

@@ -25,10 +25,13 @@ from swarmsim.world.events import FAILSAFES, KINDS, LOSSES
 SURE_SIGMA = 2.0  # the greatest dose rate is that of the reading that is greatest less so many standard deviations
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "rerun-sdk")
 _ESTIMATE_KEYS = (
+    "nuclide",
     "position_m",
     "position_std_m",
+    "position_covariance_m2",
     "error_m",
     "error_horizontal_m",
+    "true_nuclide",
     "activity_mbq",
     "activity_std_mbq",
     "activity_error_percent",
@@ -40,6 +43,8 @@ _ESTIMATE_KEYS = (
     "kerma_rate_1m_ugy_h",
     "kerma_rate_1m_std_ugy_h",
 )
+_NOT_SUMMED_UP = ("true_", "source_covariance_", "survey_estimate_covariance_")
+"""Beginnings of the columns of a batch's missions that have no median worth telling."""
 INTACT = "intact"
 STATES = {
     "crash": "crashed",
@@ -69,7 +74,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
 
     Errors are distances to the nearest true source: of the hotspot on the map (horizontal), of the source in space. A
     line or an area counts by its centre of activity, a source on a vehicle by where it was at the start; activities are
-    those of the start.
+    those of the start. ``departures`` is what was drawn for the mission within its knowledge (`departures_summary`).
     """
     record = record.finite()
     hotspot = _hotspot(record.map)
@@ -90,7 +95,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         },
         "survey_estimate": estimate_summary(record.survey_estimate, record),
         "source": estimate_summary(record.estimate, record),
-        "further_sources": [estimate_summary(one, record) | {"nuclide": one.nuclide} for one in record.further],
+        "further_sources": [estimate_summary(one, record) for one in record.further],
         "nuclide": {
             "name": named(spectrum),
             "confidence": None if spectrum is None else float(spectrum.confidence),
@@ -103,6 +108,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
             | _true_dose(record, s)
             for s in record.sources
         ],
+        "departures": departures_summary(record),
         "vehicles": [
             {
                 "name": v.name,
@@ -117,6 +123,24 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "real_time_factor": real_time_factor([record], timings),
         "timing": timing_summary(timings),
         "versions": versions(),
+    }
+
+
+def departures_summary(record: MissionRecord) -> dict[str, dict[str, Any]] | None:
+    """Truth that was drawn for the mission, for validation; None where no vehicle has a detector.
+
+    ``thickness_factor``: true over presumed thickness, by material of the walls (none where walls are presumed exactly
+    or not at all). ``sensitivity_factor``: true over presumed sensitivity, by detector model. ``pose_error_m``:
+    measured less true place (east, north, up) by vehicle, the same throughout; it is in what the estimate of sources
+    works on (none without one), and not in the places of ``measurements.parquet``, which are true.
+    """
+    made = record.departures
+    if made is None:
+        return None
+    return {
+        "thickness_factor": dict(made.thickness_factor),
+        "sensitivity_factor": dict(made.sensitivity_factor),
+        "pose_error_m": {name: _plain(error) for name, error in made.pose_error_m.items()},
     }
 
 
@@ -180,11 +204,13 @@ def _hotspot(made: RadiationMap | None) -> NDArray[np.floating] | None:
 def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[str, Any]:
     """An estimate with its standard deviations and its errors against the nearest true source of the mission.
 
-    ``error_m`` is the distance in space, ``error_horizontal_m`` the distance on the map; ``activity_error_percent`` is
-    the size of the error over the true activity. ``several_within_m`` is there where it may be several sources, so near
-    to one another; ``beside_noticed_mbq`` is the activity from which on another one of its nuclide, 3 to 12 m off,
-    would have been noticed (`Estimate.beside_mbq`). Dose rates 1 m from the source are those of its activity with
-    nothing around it; their standard deviations are the activity's, for the nuclide that was estimated.
+    ``position_covariance_m2`` is that of the place (east, north, up). ``error_m`` is the distance in space,
+    ``error_horizontal_m`` the distance on the map, ``true_nuclide`` the nuclide of that source, and
+    ``activity_error_percent`` the size of the error over its activity. ``several_within_m`` is there where it may be
+    several sources, so near to one another; ``beside_noticed_mbq`` is the activity from which on another one of its
+    nuclide, 3 to 12 m off, would have been noticed (`Estimate.beside_mbq`). Dose rates 1 m from the source are those of
+    its activity with nothing around it; their standard deviations are the activity's, for the nuclide that was
+    estimated.
     """
     if estimate is None:
         return dict.fromkeys(_ESTIMATE_KEYS)
@@ -193,10 +219,13 @@ def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[s
     nearest, error = _nearest(position, sources)
     activity = float(estimate.activity_mbq)
     values = (
+        estimate.nuclide,
         _plain(position),
         _plain(np.sqrt(np.maximum(np.diag(estimate.covariance_m2), 0.0))),
+        np.asarray(estimate.covariance_m2, float).tolist(),
         error,
         _nearest(position[:2], sources)[1],
+        None if nearest is None else nearest.nuclide,
         activity,
         float(estimate.activity_std_mbq),
         None
@@ -309,7 +338,11 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
         values = estimate_summary(estimate, record)
         row |= _axes(name, values.pop("position_m"), ("east_m", "north_m", "up_m"))
         row |= _axes(name, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
+        row |= _covariances(name, values.pop("position_covariance_m2"))
         row |= {f"{name}_{key}": value for key, value in values.items()}
+    if record.departures is not None:
+        row |= {f"true_thickness_factor_{key}": value for key, value in record.departures.thickness_factor.items()}
+        row |= {f"true_sensitivity_factor_{key}": value for key, value in record.departures.sensitivity_factor.items()}
     row["sources_found"] = len(record.estimates)
     row["nuclide"] = named(record.spectrum)
     row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
@@ -326,6 +359,12 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
 
 def _axes(name: str, values: list[float] | None, axes: tuple[str, ...]) -> dict[str, float | None]:
     return {f"{name}_{axis}": None if values is None else values[k] for k, axis in enumerate(axes)}
+
+
+def _covariances(name: str, matrix: list[list[float]] | None) -> dict[str, float | None]:
+    """The covariances [m2] of a place between axes; its variances follow from the standard deviations."""
+    pairs = {"east_north": (0, 1), "east_up": (0, 2), "north_up": (1, 2)}
+    return {f"{name}_covariance_{axes}_m2": None if matrix is None else matrix[i][j] for axes, (i, j) in pairs.items()}
 
 
 def succeeded(record: MissionRecord) -> bool:
@@ -367,7 +406,7 @@ def batch_summary(rows: Sequence[dict[str, Any]], records: Sequence[MissionRecor
     for key in all_keys(rows):
         found = (row.get(key) for row in rows)
         values = [value for value in found if isinstance(value, int | float) and not isinstance(value, bool)]
-        if key != "seed" and values:
+        if key != "seed" and values and not key.startswith(_NOT_SUMMED_UP):
             spread = (("median", np.median), ("min", np.min), ("max", np.max))
             numbers[key] = {name: float(of(values)) for name, of in spread} | {"found": len(values)}
     seeds = [row["seed"] for row in rows]

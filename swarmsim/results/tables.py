@@ -18,17 +18,23 @@ _FRAME = "ENU: east, north, up in metres from the site's origin; quaternion w x 
 _MEASURED = (
     "detector samples; position is the crystal's (mean of the count), time the end of a count; counts_A_B_kev are the "
     "counts by energy window (the lowest and the highest window hold what lies beyond, null: the detector has no such "
-    "window); dose rates are ambient dose equivalent H*(10) and air kerma derived from the counts, background included"
+    "window); exposure_s is the real time that counts stand for, dead time included (1 s for an idealised one), and "
+    "count_rate_cps the counts over it; live_s is the live time, the exposure less the dead time by the detector's "
+    "law; dose rates are ambient dose equivalent H*(10) and air kerma by the counts over the live time, background "
+    "included"
 )
 _SPECTRUM = (
     "spectrum that the nuclide was identified by, summed over samples near the source (energy: centre of the channel) "
     "with the expected background and the fit; drawn by itself and without dead time: its total exceeds the samples' "
-    "counts by what the counter missed, and differs by statistics"
+    "counts by what the counter missed, and differs by statistics; live_time_s is the real time of its "
+    "samples, all of which is live"
 )
 _MISSIONS = (
     "missions of a batch, a row each: seed, status and finding; drawn_ what was drawn for it; PHASE_ what that phase "
-    "measured; survey_estimate_ and source_ the surest source after the survey and in the end, by all counts (std_ the "
-    "standard deviations, error_m the distance to the nearest true source); sources_found how many; nuclide and "
+    "measured; survey_estimate_ and source_ the surest source after the survey and in the end, by all counts (nuclide "
+    "that it was estimated as; std_ the standard deviations, covariance_ the covariances of the place, error_m the "
+    "distance to the nearest true source, true_nuclide that one's); true_thickness_factor_MATERIAL and "
+    "true_sensitivity_factor_DETECTOR true over presumed, as drawn for it; sources_found how many; nuclide and "
     "nuclide_confidence of the spectrum taken near it; success whether the answer is right and nothing went wrong"
 )
 

@@ -253,9 +253,17 @@ class Spread:
 
     def of(self, mission: int) -> Any:
         """The pytree of one mission, on the host."""
+        return self.part(mission, lambda whole: whole)
+
+    def part(self, mission: int, chosen: Callable[[Any], Any]) -> Any:
+        """What ``chosen`` takes of the pytree of one mission, on the host; nothing else is fetched from the devices."""
         own, shared = iter(self.own), iter(self.shared)
-        leaves = [np.asarray(next(own)[mission]) if carries else np.asarray(next(shared)) for carries in self.carries]
-        return jax.tree.unflatten(self.structure, leaves)
+        arrays = [next(own) if carries else next(shared) for carries in self.carries]
+
+        def fetched(number: int) -> np.ndarray:
+            return np.asarray(arrays[number][mission] if self.carries[number] else arrays[number])
+
+        return jax.tree.map(fetched, chosen(jax.tree.unflatten(self.structure, range(len(arrays)))))
 
 
 def _among_cores(function: Callable[..., Any], *arguments: Any) -> Any:

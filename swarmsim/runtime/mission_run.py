@@ -83,7 +83,7 @@ class MissionRun:
 
     def reset(self, keys: Any) -> tuple[MissionState, Signals]:
         """All missions at their beginning."""
-        self._tell.phase("compile", 0.0)
+        self._tell.phase("prepare", 0.0)
         begun: tuple[MissionState, Signals] = self._batch.run("reset", _begin_mission, self._inputs, keys)
         return begun
 

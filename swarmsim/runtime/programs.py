@@ -21,6 +21,7 @@ import jax
 
 from swarmsim.device import on_processor
 from swarmsim.runtime.clock import Clock, Source
+from swarmsim.runtime.compilations import COMPILATIONS
 from swarmsim.runtime.environment import environment, settings
 from swarmsim.runtime.executables import Executable, Executables, UnstorableError, cache_reads, load
 from swarmsim.runtime.fingerprint import UnidentifiableError, fingerprint, sharding_text
@@ -151,6 +152,10 @@ class Program:
 
     def _compile(self, arguments: Sequence[Any]) -> tuple[_Ready, bool]:
         """The function of flat arguments and results, compiled, with the tree of its results; whether JAX had it."""
+        with COMPILATIONS.of(self.name):
+            return self._traced_and_compiled(arguments)
+
+    def _traced_and_compiled(self, arguments: Sequence[Any]) -> tuple[_Ready, bool]:
         leaves, structure = jax.tree.flatten(tuple(arguments))
         trees = []
 

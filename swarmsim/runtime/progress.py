@@ -1,14 +1,23 @@
-"""Progress of a rollout: the phase, the simulated time and the speed."""
+"""Progress of a rollout: the phase, the simulated time and the speed, and what is being compiled."""
 
 import time
+from collections.abc import Iterable
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Protocol
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as RichBar
+from rich.text import Text
+
+from swarmsim.runtime.compilations import COMPILATIONS
 
 _NAME_WIDTH = 28  # of the longest name of phases that is shown in full
+
+
+COMPILING = "compiling: the first run of a mission takes minutes, later ones load what is compiled now"
+"""What a log is told when programs begin to be compiled."""
 
 
 class Progress(Protocol):
@@ -37,8 +46,23 @@ class SilentProgress:
         """Do nothing."""
 
 
+class _Bars(RichBar):
+    """Bars, and below them what is being compiled and for how long."""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Yield the bars, then the line while there is one."""
+        yield from super().get_renderables()
+        names, seconds = COMPILATIONS.under_way()
+        if names:
+            minutes, rest = divmod(int(seconds), 60)
+            text = f"compiling for {minutes}:{rest:02d}: {', '.join(names)}; later runs load what is compiled now"
+            yield Text(text, style="dim", overflow="ellipsis", no_wrap=True)
+
+
 class RichProgress:
     """A bar on the terminal for each phase; a context manager, so that the terminal is left as it was.
+
+    Below the bars stand the programs that are being compiled; where there is no terminal, a line tells it once.
 
     The speed is simulated time (of all ``missions`` together) over wall time since the first segment of the phase
     ended: the first one may hold the compilation.
@@ -47,7 +71,7 @@ class RichProgress:
     def __init__(self, console: Console | None = None, missions: int = 1):
         """Draw on ``console`` (standard error when None)."""
         self._missions = missions
-        self._bar = RichBar(
+        self._bar = _Bars(
             TextColumn(f"{{task.description:<{_NAME_WIDTH}}}"),
             BarColumn(),
             TextColumn("{task.fields[simulated]:>18}"),
@@ -58,14 +82,19 @@ class RichProgress:
         self._task: TaskID | None = None
         self._horizon_s = 0.0
         self._first: tuple[float, float] | None = None  # wall time and simulated time after the first segment
+        self._listening = ExitStack()
+        self._told = False
 
     def __enter__(self) -> "RichProgress":
         """Start drawing."""
+        if not self._bar.console.is_terminal:
+            self._listening.enter_context(COMPILATIONS.listened_to(self._tell_of_compiling))
         self._bar.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         """Stop drawing; a phase that came to its end is shown as full."""
+        self._listening.close()
         if kind is None:
             self._close()
         self._bar.stop()
@@ -92,6 +121,11 @@ class RichProgress:
     def message(self, text: str) -> None:
         """Print above the bars."""
         self._bar.console.print(text, highlight=False, markup=False)
+
+    def _tell_of_compiling(self) -> None:
+        if not self._told:
+            self._told = True
+            self.message(COMPILING)
 
     def _close(self) -> None:
         if self._task is not None:

@@ -60,7 +60,7 @@ class Reading:
     axis: jax.Array  # [U, 3] unit vector along the crystal, mean, world
     counts: jax.Array  # [U]
     rois: jax.Array  # [U, R] the same counts by region of interest (`Spectrometer.rois_kev`)
-    exposure_s: jax.Array  # [U] that the counts stand for
+    exposure_s: jax.Array  # [U] real time that the counts stand for, dead time included
     valid: jax.Array  # [U] bool: the vehicle had a part in the mission throughout
     fresh: jax.Array  # [U] bool: completed in this control period
 
@@ -210,10 +210,10 @@ def _drawn(
     counter: Counter, rate_cps: jax.Array, member: jax.Array, key: jax.Array, tick: jax.Array, control_period_s: float
 ) -> jax.Array:
     """Counts [U, R] of an exposure with the sum ``rate_cps`` [U, R] over its evaluations."""
-    live_s = jnp.float32(counter.ticks * counter.evaluations * control_period_s)
+    period_s = jnp.float32(counter.ticks * counter.evaluations * control_period_s)
     keys = randomness.per_vehicle(randomness.consumer(key, "counts"), tick, member)
     mean = jax.lax.stop_gradient(rate_cps / counter.evaluations)
-    return jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, live_s)[0])(keys, mean)
+    return jax.vmap(lambda key, mean: draw_counts(counter.detector, key, mean, period_s)[0])(keys, mean)
 
 
 def _read_out(
@@ -221,14 +221,14 @@ def _read_out(
 ) -> CounterState:
     """The reading of a completed exposure, and the beginning of the next one."""
     n, vehicles = counter.evaluations, state.used.shape[0]
-    live_s = jnp.float32(counter.ticks * n * control_period_s)
+    period_s = jnp.float32(counter.ticks * n * control_period_s)
     mean = state.rate_cps / n
-    exposure = jnp.broadcast_to(exposure_of(counter.detector, live_s), (vehicles,))
+    exposure = jnp.broadcast_to(exposure_of(counter.detector, period_s), (vehicles,))
     norm = jnp.sqrt(jnp.sum(state.axis**2, axis=-1, keepdims=True) + 1e-12)
     reading = Reading(
         time_s=jnp.broadcast_to(tick * jnp.float32(control_period_s), (vehicles,)),
         position_m=state.position_m / n,
-        travel_m=state.velocity_m_s / n * live_s,
+        travel_m=state.velocity_m_s / n * period_s,
         axis=state.axis / norm,
         counts=jnp.sum(counts, axis=-1),
         rois=counts,

@@ -125,8 +125,78 @@ def test_a_vehicle_extends_another(mission: Path) -> None:
     path = mission.parents[1] / "vehicles" / "heavy.yaml"
     path.write_text("extends: tarot_t650\nname: heavy\nmass_kg: 4.5\n")
     base, heavy = load_named("vehicles", "tarot_t650"), load_named("vehicles", "heavy")
-    assert heavy == base.model_copy(update={"name": "heavy", "mass_kg": 4.5})
+    sources = base.sources | {"mass_kg": "heavy.yaml gives no source"}
+    assert heavy == base.model_copy(update={"name": "heavy", "mass_kg": 4.5, "sources": sources})
     assert isinstance(load_model(path, Vehicle), Multirotor)
+
+
+@pytest.mark.parametrize(
+    ("changes", "cited", "gone"),
+    [
+        ("mass_kg: 4.5\nsources: {mass_kg: weighed}", {"mass_kg": "weighed"}, ()),
+        ("rotor: {radius_m: 0.2}", {"rotor.radius_m": "child.yaml gives no source"}, ()),
+        ("rotor: {radius_m: 0.2}\nsources: {rotor: data sheet}", {"rotor": "data sheet"}, ("rotor.radius_m",)),
+        ("feet: {friction: 0.123}", {"feet.friction": "child.yaml gives no source"}, ()),
+        ("rotor: {solidity: null}", {}, ("rotor.solidity",)),
+        (
+            "inertia_kg_m2: [0.1, 0.1, 0.18]\nsources: {inertia_kg_m2.2: a swing}",
+            {"inertia_kg_m2.2": "a swing", "inertia_kg_m2": "child.yaml gives no source"},
+            (),
+        ),
+    ],
+)
+def test_an_inherited_source_is_not_that_of_a_changed_value(
+    changes: str, cited: dict[str, str], gone: tuple[str, ...], mission: Path
+) -> None:
+    folder = mission.parents[1] / "vehicles"
+    (folder / "child.yaml").write_text(f"extends: tarot_t650\nname: child\n{changes}\n")
+    base, child = load_named("vehicles", "tarot_t650"), load_named("vehicles", "child")
+    expected = {path: text for path, text in (base.sources | cited).items() if path not in gone}
+    assert child.sources == expected
+    (folder / "grandchild.yaml").write_text("extends: child\nname: grandchild\ncollision_radius_m: 0.6\n")
+    last = load_named("vehicles", "grandchild").sources
+    assert last == expected | {"collision_radius_m": "grandchild.yaml gives no source"}
+
+
+def test_a_value_that_is_stated_again_keeps_its_source(mission: Path) -> None:
+    folder, base = mission.parents[1] / "vehicles", load_named("vehicles", "tarot_t650")
+    (folder / "same.yaml").write_text(f"extends: tarot_t650\nname: same\nmass_kg: {base.mass_kg}\n")
+    assert load_named("vehicles", "same").sources == base.sources
+
+
+def test_a_detector_and_a_nuclide_do_not_pass_on_sources_of_what_was_changed(mission: Path) -> None:
+    folder = mission.parents[1]
+    spoil(
+        folder / "detectors" / "nai_1p5x1p5.yaml", "{all: made up for the tests}", "{length_mm: made up, housing: so}"
+    )
+    (folder / "detectors" / "thin.yaml").write_text("extends: nai_1p5x1p5\nname: thin\nlength_mm: 5.0\n")
+    (folder / "nuclides" / "Co-60m.yaml").write_text("extends: Co-60\nname: Co-60m\nhalf_life_s: 628.0\n")
+    thin, base = load_named("detectors", "thin"), load_named("detectors", "nai_1p5x1p5")
+    assert thin.sources == base.sources | {"length_mm": "thin.yaml gives no source"}
+    short, long = load_named("nuclides", "Co-60m"), load_named("nuclides", "Co-60")
+    assert short.source == f"Co-60m.yaml gives no source of half_life_s; the rest: {long.source}"
+
+
+def test_an_override_of_a_definition_is_not_cited_as_what_it_replaces(mission: Path) -> None:
+    detector = mission.parents[1] / "detectors" / "nai_1p5x1p5.yaml"
+    spoil(detector, "{all: made up for the tests}", "{dead_time: made up}")
+    mass = "definitions.vehicles.tarot_t650.mass_kg=4.2"
+    dead = "definitions.detectors.nai_1p5x1p5.dead_time={model: paralyzable, paralyzable_us: 8}"
+    half_life = "definitions.nuclides.Co-60.half_life_s=1e3"
+    scenario = load_scenario("recon", [mass, dead, half_life])
+    assert scenario.vehicles[0].sources["mass_kg"] == "--set gives no source"
+    assert scenario.detectors["nai_1p5x1p5"].sources["dead_time"] == "--set gives no source"
+    assert scenario.nuclides["Co-60"].source.startswith("--set gives no source of half_life_s; the rest: ")
+    assert "--set gives no source" in scenario.to_yaml()
+    weighed = load_scenario("recon", [mass, "definitions.vehicles.tarot_t650.sources.mass_kg=weighed"])
+    assert weighed.vehicles[0].sources["mass_kg"] == "weighed"
+
+
+def test_a_mission_that_changes_a_definition_of_the_one_it_extends_does_not_pass_on_its_source(mission: Path) -> None:
+    resolved, child = mission.with_name("resolved.yaml"), mission.with_name("child.yaml")
+    resolved.write_text(load_scenario("recon").to_yaml().replace("name: recon", "name: resolved", 1))
+    child.write_text("extends: resolved\nname: child\ndefinitions: {vehicles: {tarot_t650: {mass_kg: 4.2}}}\n")
+    assert load_scenario("child").vehicles[0].sources["mass_kg"] == "child.yaml gives no source"
 
 
 def test_overrides_change_values_by_field_index_and_name(mission: Path) -> None:
@@ -173,7 +243,9 @@ def test_a_value_given_in_python_is_told_as_such(mission: Path) -> None:
 def test_an_override_reaches_into_a_vehicle(mission: Path) -> None:
     scenario = load_scenario("recon", ["definitions.vehicles.tarot_t650.mass_kg=4.0"])
     assert scenario.vehicles[0].mass_kg == 4.0
-    assert scenario.vehicles[0] == load_named("vehicles", "tarot_t650").model_copy(update={"mass_kg": 4.0})
+    base = load_named("vehicles", "tarot_t650")
+    sources = base.sources | {"mass_kg": "--set gives no source"}
+    assert scenario.vehicles[0] == base.model_copy(update={"mass_kg": 4.0, "sources": sources})
     assert scenario.vehicles[3] == load_named("vehicles", "orpheus")
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib.image
@@ -14,7 +15,7 @@ from matplotlib.patches import Ellipse
 from matplotlib.text import Text
 
 from swarmsim.playback import figures, plan
-from swarmsim.playback.colours import TRUTH
+from swarmsim.playback.colours import TRUTH, away_from_pads, rate_scales
 from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 from tests import synthetic
@@ -41,7 +42,9 @@ def check_plan(axes: Axes) -> None:
     assert axes.get_aspect() == 1.0
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("East [m]", "North [m]")
     assert axes.get_ylim()[0] < axes.get_ylim()[1]
-    assert "N" in [text.get_text() for text in axes.texts]
+    (arrow,) = [text for text in axes.texts if text.get_text() == "N"]
+    axes.figure.canvas.draw()
+    assert not arrow.get_window_extent().overlaps(axes.get_window_extent())  # it hides nothing
 
 
 def test_trajectories_show_every_track_over_the_buildings(found: MissionRecord, site: SiteModel) -> None:
@@ -91,9 +94,42 @@ def test_map_shows_truth_hotspot_and_the_ellipse_of_95_percent(found: MissionRec
         assert ellipse.height == pytest.approx(2 * np.sqrt(5.991 * variances[0]), rel=1e-3)
     assert (*whole.get_xlim(), *whole.get_ylim()) == pytest.approx((-75, 75, -60, 60))
     assert {"hotspot", "true source", "survey estimate, 95 % ellipse"} <= set(labels(whole))
-    assert any(text.startswith("Count rate, interpolated, $\\pm$ ") for text in texts(figure))
+    assert any(text.startswith("Count rate, interpolated [1/s]\n(median standard deviation ") for text in texts(figure))
     contours = [text for text in texts(figure) if text.isdigit() and 95 < int(text) < 240]
     assert len(contours) >= 2
+
+
+def test_what_lies_in_another_box_has_no_outline_of_its_own(site: SiteModel) -> None:
+    boxes = site.site.obstacles
+    half, centre = np.asarray(boxes.half_extent_m).copy(), np.asarray(boxes.centre_m).copy()
+    half[1], centre[1] = 0.3 * half[0], centre[0]  # in the first one, with sides along others
+    half[3], centre[3] = half[2], centre[2]  # as the third one
+    axis = np.asarray(boxes.axis).copy()
+    axis[1] = (0.6, 0.8)
+    obstacles = dataclasses.replace(boxes, half_extent_m=half, centre_m=centre, axis=axis)
+    axes = plan.new_figure(3.5, 3.0).add_axes((0.0, 0.0, 1.0, 1.0))
+    plan.outline_site(axes, dataclasses.replace(site, site=dataclasses.replace(site.site, obstacles=obstacles)))
+    (shapes,) = axes.collections
+    assert len(shapes.get_paths()) == len(synthetic.BUILDINGS) - 2
+
+
+def test_counts_above_the_pads_do_not_set_the_scale_of_a_survey(found: MissionRecord, site: SiteModel) -> None:
+    phase, samples = found.phases[0], found.samples
+    pads = np.array([vehicle.position_m[0, :2] for vehicle in found.vehicles])
+    near = np.linalg.norm(samples.position_m[:, :2] - pads[samples.vehicle], axis=1) < 2.0
+    assert near.any()
+    loud = np.where(near & (samples.phase == phase.name), 50.0, 1.0) * samples.counts
+    record = dataclasses.replace(found, samples=dataclasses.replace(samples, counts=loud))
+    scale, louder = (rate_scales(each)["flown"].limits_cps[1] for each in (found, record))
+    assert louder == pytest.approx(scale)
+    figure = figures.flown_measurements(phase, record, site)
+    (dots,) = [c for c in figure.axes[0].collections if isinstance(c, PathCollection)]
+    assert np.asarray(dots.get_array()).max() > 2.0 * dots.norm.vmax
+    assert dots.colorbar is not None
+    assert dots.colorbar.extend == "max"
+    still = dataclasses.replace(found.vehicles[0], position_m=np.tile(found.vehicles[0].position_m[0], (2, 1)))
+    own = samples.rows(near & (samples.vehicle == 0))
+    assert away_from_pads(dataclasses.replace(found, vehicles=(still,)), own).all()  # rather than nothing
 
 
 def test_ellipse_holds_95_percent_of_a_normal_distribution(found: MissionRecord) -> None:
@@ -160,6 +196,33 @@ def test_spectrum_has_its_fit_lines_and_residuals(found: MissionRecord, site: Si
     residuals = np.asarray(lower.lines[-1].get_ydata())
     assert residuals.std() == pytest.approx(1.0, abs=0.15)  # the fit is the truth here
     assert "Co-60, confidence > 0.999" in texts(figure)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ([661.7, 36.4, 31.8, 32.2], ["32–36 keV", "662 keV"]),
+        ([39.5, 45.4, 121.8, 1085.8, 1089.7, 1112.1], ["40–45 keV", "122 keV", "1088 keV", "1112 keV"]),
+        ([1368.6, 2754.0, 2994.0], ["1369 keV", "2754 keV", "2994 keV"]),
+        ([], []),
+        ([*np.arange(30.0, 2990.0, 20.0)], ["30–2970 keV"]),
+    ],
+)
+def test_labels_of_lines_are_beside_one_another_above_the_curves(
+    lines: list[float], said: list[str], found: MissionRecord, site: SiteModel
+) -> None:
+    assert found.spectrum is not None
+    spectrum = dataclasses.replace(found.spectrum, lines_kev=np.array(lines))
+    figure = figures.spectrum(dataclasses.replace(found, spectrum=spectrum), site)
+    figure.canvas.draw()
+    upper = figure.axes[0]
+    assert [text.get_text() for text in upper.texts] == said
+    inside = upper.get_window_extent()
+    boxes = [Text.get_window_extent(text) for text in upper.texts]  # without the leader
+    assert all(inside.x0 <= b.x0 and b.x1 <= inside.x1 and b.y1 <= inside.y1 for b in boxes)
+    assert all(a.x1 <= b.x0 + 0.5 for a, b in pairwise(boxes))
+    top = upper.transData.transform((0.0, float(np.max(upper.lines[0].get_ydata()))))[1]
+    assert all(b.y0 > top for b in boxes)
 
 
 NAMES = ["trajectories", "measurements_survey", "measurements_search", "radiation_map", "spectrum"]

@@ -57,6 +57,9 @@ def test_the_figure_tells_the_errors(site):
     texts = [text.get_text() for text in errors.get_legend().get_texts()]
     assert texts == ["from the planned path, rms 0.30 m", "from the simulated vehicle, rms 0.30 m"]
     assert [text.get_text() for text in above.get_legend().get_texts()][:3] == ["planned", "simulated", "flown"]
+    assert errors.get_ylim()[1] > 0.31  # one that is constant is not hidden by the frame
+    figure.canvas.draw()
+    assert figure.get_tightbbox(figure.canvas.get_renderer()).x0 >= 0.0
     low, high = above.get_xlim()
     assert low < -60.0
     assert high > -40.0

@@ -213,12 +213,12 @@ def test_dead_time_laws(library: Library) -> None:
 
 
 def test_poisson_counts(detectors: Detectors) -> None:
-    """Physical counts stand for the live time; the ideal kind draws Poisson(rate) whatever the live time is."""
-    mean, live, n = 134.0, 0.09, 20_000
+    """Physical counts stand for the real time; the ideal kind draws Poisson(rate) whatever the real time is."""
+    mean, period_s, n = 134.0, 0.09, 20_000
     keys = jax.random.split(jax.random.key(1), n)
-    for kind, expected, seconds in (("physical", mean * live, live), ("paper_ideal", mean, 1.0)):
+    for kind, expected, seconds in (("physical", mean * period_s, period_s), ("paper_ideal", mean, 1.0)):
         detector = detectors["nai_1p5x1p5", kind]
-        counts, exposure = jax.vmap(lambda k, d=detector: draw_counts(d, k, jnp.float32(mean), live))(keys)
+        counts, exposure = jax.vmap(lambda k, d=detector: draw_counts(d, k, jnp.float32(mean), period_s))(keys)
         assert np.allclose(exposure, seconds)
         sample = np.asarray(counts, np.float64)
         assert sample.mean() == pytest.approx(expected, abs=4 * np.sqrt(expected / n))

@@ -94,9 +94,23 @@ def test_several_sources_and_doubts_are_told():
     assert said.endswith("; but a; b")
 
 
+@pytest.mark.parametrize(
+    ("activity", "std", "said"),
+    [
+        (170.4, 3.14, "170.4 ± 3.1"),
+        (170.4, 12.7, "170 ± 13"),
+        (0.0107, 0.00213, "0.0107 ± 0.0021"),
+        (21500.0, 1830.0, "21500 ± 1830"),
+    ],
+)
+def test_the_activity_is_told_with_its_standard_deviation(activity, std, said):
+    one = (replace(estimate(activity=activity), activity_std_mbq=std),)
+    assert f"a source of {said} MBq Co-60 at (" in finding(SURE, one, None, hindrance=None, presumed=False)
+
+
 def test_the_activity_of_a_faint_source_is_not_zero():
     for activity, said in ((0.0107, "0.011 MBq"), (9.96, "10 MBq"), (170.4, "170 MBq")):
-        faint = (estimate(activity=activity),)
+        faint = (replace(estimate(activity=activity), activity_std_mbq=0.0),)
         assert f"a source of {said} Co-60" in finding(SURE, faint, None, hindrance=None, presumed=False)
 
 

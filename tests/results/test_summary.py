@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from swarmsim.results.record import Event, MissionRecord, Phase, Samples, TrueSource, VehicleRecord
+from swarmsim.results.record import Departures, Event, MissionRecord, Phase, Samples, TrueSource, VehicleRecord
 from swarmsim.results.summary import STATES, Timings, batch_row, batch_summary, real_time_factor, succeeded, summary
 from swarmsim.world.events import KINDS
 from tests import synthetic
@@ -134,6 +134,34 @@ def test_errors_against_the_truth(found: MissionRecord) -> None:
     assert made["source"]["activity_error_percent"] == pytest.approx(100 * 4.0 / 170.0)
     assert made["hotspot"]["error_m"] == pytest.approx(0.8 * np.sqrt(2))
     assert made["nuclide"] == {"name": "Co-60", "confidence": 0.9997}
+
+
+def test_an_estimate_has_its_nuclide_the_true_one_and_the_covariance_of_its_place(found: MissionRecord) -> None:
+    assert found.estimate is not None
+    other = dataclasses.replace(found, estimate=dataclasses.replace(found.estimate, nuclide="Co-57"))
+    made = summary(other, TIMINGS)
+    assert (made["source"]["nuclide"], made["source"]["true_nuclide"]) == ("Co-57", "Co-60")
+    covariance = np.array(made["source"]["position_covariance_m2"])
+    np.testing.assert_allclose(covariance, found.estimate.covariance_m2)
+    row = batch_row(other)
+    assert (row["source_nuclide"], row["source_true_nuclide"]) == ("Co-57", "Co-60")
+    assert row["source_covariance_east_north_m2"] == pytest.approx(covariance[0, 1])
+    assert row["source_covariance_north_up_m2"] == pytest.approx(covariance[1, 2])
+
+
+def test_what_was_drawn_within_the_knowledge_is_told_for_validation(found: MissionRecord) -> None:
+    assert summary(found, TIMINGS)["departures"] is None
+    made = Departures({"brick": 1.2}, {"nai_1p5x1p5": 0.97}, {"uav1": np.array([0.01, -0.02, 0.03], np.float32)})
+    record = dataclasses.replace(found, departures=made)
+    told = summary(record, TIMINGS)["departures"]
+    assert told["thickness_factor"] == {"brick": 1.2}
+    assert told["sensitivity_factor"] == {"nai_1p5x1p5": 0.97}
+    assert told["pose_error_m"] == {"uav1": pytest.approx([0.01, -0.02, 0.03])}
+    json.dumps(told)
+    rows = [batch_row(record)] * 2
+    assert rows[0]["true_thickness_factor_brick"] == 1.2
+    assert rows[0]["true_sensitivity_factor_nai_1p5x1p5"] == 0.97
+    assert not any(key.startswith("true_") for key in batch_summary(rows, [record] * 2, TIMINGS)["metrics"])
 
 
 def test_activity_error_is_a_size_whatever_its_sign(found: MissionRecord) -> None:

@@ -2,10 +2,14 @@
 
 import io
 
+import jax.numpy as jnp
 import pytest
 from rich.console import Console
 
-from swarmsim.runtime.progress import RichProgress, SilentProgress
+from swarmsim.runtime.clock import Clock
+from swarmsim.runtime.compilations import COMPILATIONS
+from swarmsim.runtime.programs import Program
+from swarmsim.runtime.progress import COMPILING, RichProgress, SilentProgress
 
 
 def test_the_bar_shows_phase_time_and_speed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -23,6 +27,36 @@ def test_the_bar_shows_phase_time_and_speed(monkeypatch: pytest.MonkeyPatch) -> 
     assert "200 / 300 s" in text
     assert "100 x real time" in text  # 2 missions of 100 s in 2 s
     assert "said" in text
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_it_says_what_is_being_compiled_and_for_how_long(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("swarmsim.runtime.compilations.time.monotonic", lambda: now[0])
+    screen = io.StringIO()
+    with RichProgress(Console(file=screen, force_terminal=terminal, width=100)) as progress:
+        progress.phase("prepare", 0.0)
+        with COMPILATIONS.of("estimate"), COMPILATIONS.of("run"):
+            now[0] = 175.0
+            assert COMPILATIONS.under_way() == (("estimate", "run"), 75.0)
+            progress._bar.refresh()
+        assert COMPILATIONS.under_way() == ((), 0.0)
+        before = screen.tell()
+        progress._bar.refresh()
+        assert "compiling" not in screen.getvalue()[before:]
+    assert ("compiling for 1:15: estimate, run; later runs" in screen.getvalue()) == terminal
+    assert screen.getvalue().count(COMPILING) == (0 if terminal else 1)
+
+
+def test_a_program_is_told_while_it_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SWARMSIM_CACHE", "0")  # or an earlier test run has stored it
+    seen: list[tuple[str, ...]] = []
+    with COMPILATIONS.listened_to(lambda: seen.append(COMPILATIONS.under_way()[0])):
+        assert Program("twice", lambda x: 2.0 * x, clock=Clock())(jnp.float32(1.5)) == 3.0
+    assert seen == [("twice",)]
+    with pytest.raises(ValueError, match="no"), COMPILATIONS.of("fails"):
+        raise ValueError("no")
+    assert COMPILATIONS.under_way() == ((), 0.0)
 
 
 def test_a_bar_needs_a_phase_and_silence_needs_nothing() -> None:
