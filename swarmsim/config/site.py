@@ -4,9 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from swarmsim.config.base import ConvexPolygon, Fraction, Model, Name, NonNegative, Positive, Vec2
-
-Polygon = Annotated[tuple[Vec2, ...], Field(min_length=3, max_length=32)]
+from swarmsim.config.base import ConvexPolygon, Fraction, Model, Name, NonNegative, Polygon, Positive
 
 
 class ObstacleMaterial(Model):
