@@ -14,11 +14,12 @@ from swarmsim.site import traversability
 from swarmsim.site.elevation import elevation_ground, elevation_mesh, read_elevation
 from swarmsim.site.ground import THICKNESS, Ground, complete_ground, found_ground, named_ground
 from swarmsim.site.mesh_parts import NO_COLOUR, Part
-from swarmsim.site.meshes import read_mesh
+from swarmsim.site.meshes import Mesh, read_mesh
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.obstacles import Box
 from swarmsim.site.part_rules import BOXES_MAX, check_patterns, described, find_obstacles, matches, unnamed_told
 from swarmsim.site.raster import Floats, Grid, faces_on, top_of_cells
+from swarmsim.site.size_checks import check_cells, check_extent
 from swarmsim.site.source_files import TIFF_SUFFIXES, check_file
 from swarmsim.site.start_places import start_places
 from swarmsim.site.step_edges import StepRasters, find_steps
@@ -27,7 +28,8 @@ from swarmsim.site.visual import visual_mesh
 
 Mask = NDArray[np.bool_]
 
-CELLS_MAX = 4_000_000
+POINTS_MAX = 200_000_000
+"""Points on the surfaces of a mesh that are looked at: a scene of this many takes half a minute."""
 FLUSH_M = 0.02  # what rises no further above the ground does not stand on it
 COARSE_M = 0.3  # cells of the raster of clearances that a user is told of
 BARE_SHARE = 0.05  # of a site that is traversable: below it there is hardly any ground
@@ -69,10 +71,11 @@ class _Separated:
 
 def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
     mesh = read_mesh(path, spec)
-    parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh.parts, spec.plane)]
+    parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh, spec.plane)]
     check_patterns(parts, spec, path)
     corners = np.concatenate([part.corners for part in parts])
     grid = _grid_of(corners, spec, path)
+    _check_effort(corners, grid, path)
     found = _separate(parts, corners, grid, spec, path)
     ground = found.ground
     things = find_obstacles(parts, found.bare, spec)
@@ -98,11 +101,12 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
     )  # fmt: skip
 
 
-def _plane(parts: list[Part], plane: Plane) -> Part:
+def _plane(mesh: Mesh, plane: Plane) -> Part:
     """Level ground under the parts and around them."""
-    points = np.concatenate([part.vertices[np.unique(part.triangles), :2] for part in parts])
+    points = np.concatenate([part.vertices[np.unique(part.triangles), :2] for part in mesh.parts])
     (west, south), (east, north) = points.min(axis=0) - plane.margin_m, points.max(axis=0) + plane.margin_m
-    vertices = np.array([[x, y, plane.height_m] for y in (south, north) for x in (west, east)])
+    height = plane.height_m - mesh.shift_m[2]
+    vertices = np.array([[x, y, height] for y in (south, north) for x in (west, east)])
     colours = np.tile(np.array(NO_COLOUR, np.uint8), (2, 1))
     return Part((PLANE,), vertices, np.array([[0, 1, 3], [0, 3, 2]]), colours)
 
@@ -111,7 +115,6 @@ def _from_elevation(path: Path, spec: SiteSpec) -> RawSite:
     model = read_elevation(path, spec)
     extent = model.grid.cell * np.array([model.grid.nx, model.grid.ny])
     nx, ny = (int(side) for side in np.floor(extent / spec.cell_m + 0.5))
-    check_cells(nx, ny, spec, path)
     shift = 0.5 * (spec.cell_m - model.grid.cell)
     origin = (model.grid.origin[0] + shift, model.grid.origin[1] + shift)
     grid = model.grid if spec.cell_m == model.grid.cell else Grid(origin, spec.cell_m, ny, nx)
@@ -151,8 +154,18 @@ def _finish(
         "traversable_share": float(np.isfinite(cost)[inside].mean()),
         "clearance_cell_m": grid.cell * grid.ny / len(clear),
     }
-    report["warnings"] += _warnings(report, ground, inside)
+    report["warnings"] += [*_warnings(report, ground, inside), *_zones_told(grid, spec)]
     return RawSite(grid, ground.height, surface, clear, cost, steps, boxes, names, area, mesh, report)
+
+
+def _zones_told(grid: Grid, spec: SiteSpec) -> list[str]:
+    """A warning of each zone that lies beyond the site."""
+    low, high = grid.bounds
+    beyond = [
+        zone.name for zone in spec.zones
+        if (np.max(zone.polygon_m, axis=0) <= low).any() or (np.min(zone.polygon_m, axis=0) >= high).any()
+    ]  # fmt: skip
+    return [f"zone '{name}' lies beyond the site" for name in beyond]
 
 
 def _warnings(report: dict[str, Any], ground: Ground, inside: Mask) -> list[str]:
@@ -193,6 +206,7 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
             suggestion="set up_axis (--up) to the axis that points up in the file, X, Y or Z; or, if it is a tower "
             "without its surroundings, lay level ground around it with plane (--plane 20)",
         )  # fmt: skip
+    check_extent((float(east), float(north)), float(up), path)
     if not spec.extent_m[0] <= max(east, north) <= spec.extent_m[1]:
         small = max(east, north) < spec.extent_m[0]
         units = (
@@ -211,13 +225,18 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
     return Grid((float(low[0]) + half, float(low[1]) + half), spec.cell_m, ny, nx)
 
 
-def check_cells(nx: int, ny: int, spec: SiteSpec, path: Path) -> None:
-    """Raise `InputError` for a grid of fewer than 3 x 3 or more than `CELLS_MAX` cells."""
-    if min(nx, ny) < 3 or nx * ny > CELLS_MAX:
+def _check_effort(corners: Floats, grid: Grid, path: Path) -> None:
+    """Raise `InputError` for triangles [t, 3, 3] that take more than `POINTS_MAX` points at the finest spacing."""
+    sides = corners[:, 1:] - corners[:, :1]
+    area = 0.5 * float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+    length = float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).sum())
+    spacing = 0.5 * grid.cell / traversability.fine_factor(grid)
+    if area / spacing**2 + length / spacing > POINTS_MAX:
+        layers = area / (grid.nx * grid.ny * grid.cell**2)
         raise InputError.of(
-            f"cells of {spec.cell_m:g} m give a grid of {nx} x {ny}", file=path, path="cell_m",
-            allowed=f"at least 3 x 3 and at most {CELLS_MAX:,} cells",
-            suggestion=f"choose {'smaller' if min(nx, ny) < 3 else 'larger'} cells: cell_m (--cell)",
+            f"the surfaces of its {len(corners):,} triangles are {layers:,.0f} times as large as the site", file=path,
+            suggestion="remove copies of meshes and what is hidden inside others, decimate the mesh, or choose larger "
+            "cells: cell_m (--cell)",
         )  # fmt: skip
 
 
