@@ -53,7 +53,7 @@ def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
     told: list[str] = []
     with _opened(path) as file:
         matrix, crs = file.transform, file.crs
-        unit, true = _scale(file, path, spec, told)
+        unit, true = _scale(file, path, spec.unit_m, told)
         height_unit = spec.height_unit_m or spec.unit_m or _height_unit(file, unit, told)
         cell = float(matrix.a) * unit * true
         east, north = file.width * cell, file.height * cell
@@ -89,11 +89,10 @@ def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
     return Elevation(grid, height - base, photo, reference, tuple(told))
 
 
-def own_cell(path: Path) -> float:
-    """Edge length of a GeoTIFF's cells on the ground, m."""
-    spec = SiteSpec(name="elevation", file=path.name, licence="-", cell_m=1.0)
+def own_cell(path: Path, unit_m: float | None = None) -> float:
+    """Edge length of a GeoTIFF's cells on the ground, m; ``unit_m`` as in `SiteSpec`."""
     with _opened(path) as file:
-        unit, true = _scale(file, path, spec, [])
+        unit, true = _scale(file, path, unit_m, [])
         return float(file.transform.a) * unit * true
 
 
@@ -114,10 +113,10 @@ def _opened(path: Path) -> Iterator[Any]:
             raise InputError.of(f"cannot be read as GeoTIFF ({reason})", file=path) from error
 
 
-def _scale(file: Any, path: Path, spec: SiteSpec, told: list[str]) -> tuple[float, float]:
+def _scale(file: Any, path: Path, unit_m: float | None, told: list[str]) -> tuple[float, float]:
     """Length in m of the unit of the projection, and what its metres measure on the ground."""
-    unit = spec.unit_m or _unit(file.crs, path, told)
-    return unit, 1.0 if spec.unit_m else _true_scale(file, path, unit, told)
+    unit = unit_m or _unit(file.crs, path, told)
+    return unit, 1.0 if unit_m else _true_scale(file, path, unit, told)
 
 
 def _unit(crs: Any, path: Path, told: list[str]) -> float:

@@ -33,6 +33,7 @@ POINTS_MAX = 200_000_000
 FLUSH_M = 0.02  # what rises no further above the ground does not stand on it
 COARSE_M = 0.3  # cells of the raster of clearances that a user is told of
 BARE_SHARE = 0.05  # of a site that is traversable: below it there is hardly any ground
+FAR_BELOW_M = 100.0  # level ground this far below or above a model is not under it
 PLANE = "level ground"  # name of the part that `SiteSpec.plane` adds
 
 
@@ -71,7 +72,7 @@ class _Separated:
 
 def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
     mesh = read_mesh(path, spec)
-    parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh, spec.plane)]
+    parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh, spec.plane, path)]
     check_patterns(parts, spec, path)
     corners = np.concatenate([part.corners for part in parts])
     grid = _grid_of(corners, spec, path)
@@ -101,11 +102,19 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
     )  # fmt: skip
 
 
-def _plane(mesh: Mesh, plane: Plane) -> Part:
+def _plane(mesh: Mesh, plane: Plane, path: Path) -> Part:
     """Level ground under the parts and around them."""
-    points = np.concatenate([part.vertices[np.unique(part.triangles), :2] for part in mesh.parts])
-    (west, south), (east, north) = points.min(axis=0) - plane.margin_m, points.max(axis=0) + plane.margin_m
+    points = np.concatenate([part.vertices[np.unique(part.triangles)] for part in mesh.parts])
+    low, high = points.min(axis=0), points.max(axis=0)
     height = plane.height_m - mesh.shift_m[2]
+    if not low[2] - FAR_BELOW_M <= height <= high[2] + FAR_BELOW_M:
+        low_m, high_m = (round(float(value) + mesh.shift_m[2], 1) for value in (low[2], high[2]))
+        raise InputError.of(
+            f"the level ground is far from the model, which reaches from {low_m:g} m to {high_m:g} m", file=path,
+            path="plane.height_m", given=f"{plane.height_m:g} m",
+            suggestion=f"set its height (--set plane.height_m={low_m:g})",
+        )  # fmt: skip
+    (west, south), (east, north) = low[:2] - plane.margin_m, high[:2] + plane.margin_m
     vertices = np.array([[x, y, height] for y in (south, north) for x in (west, east)])
     colours = np.tile(np.array(NO_COLOUR, np.uint8), (2, 1))
     return Part((PLANE,), vertices, np.array([[0, 1, 3], [0, 3, 2]]), colours)

@@ -1,6 +1,7 @@
 """OBJ files as parts: faces of any number of corners, and the names of materials and textures."""
 
 import io
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -120,7 +121,10 @@ class _Materials(dict[str, bytes]):
         self.folder = folder
 
     def __missing__(self, name: str) -> bytes:
-        return (self.folder / name.replace("\\", "/")).read_bytes()
+        path = self.folder / name.replace("\\", "/")
+        if not os.path.isfile(path):  # a pipe would be waited for
+            raise FileNotFoundError(path)
+        return path.read_bytes()
 
     def get(self, name: str, default: Any = None) -> Any:
         """The file's content; raises `OSError` where it is missing, as trimesh expects."""

@@ -6,12 +6,15 @@ import struct
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import rasterio
 import trimesh
 from rasterio.transform import Affine
 
+from swarmsim.config.errors import InputError
 from swarmsim.config.site import SiteSpec
 from swarmsim.site import Obstacles, Site
+from swarmsim.site.importer import build
 from tests.generator_scripts import script
 
 polygon_prism = script("sites/mesh_shapes.py").polygon_prism
@@ -52,6 +55,17 @@ def make_site(boxes=(), terrain=None, cell=100.0, origin=(-300.0, -300.0), mater
 def spec(**fields) -> SiteSpec:
     """A specification with cells of half a metre."""
     return SiteSpec(**{"name": "here", "file": "here.glb", "licence": "made for a test", "cell_m": 0.5} | fields)
+
+
+def refused(path, words, **fields):
+    """The import is refused with one readable problem that holds all ``words``."""
+    with pytest.raises(InputError) as caught:
+        build(path, spec(file=path.name, **fields))
+    text = str(caught.value)
+    assert "Traceback" not in text
+    for word in words:
+        assert word in text
+    return text
 
 
 def ground_plate(size=(40.0, 30.0), slope=0.0, pieces=20) -> trimesh.Trimesh:
