@@ -1,9 +1,11 @@
 """Mesh files (COLLADA, OBJ, glTF binary, STL) as named, coloured parts in metres, z up."""
 
 import io
+import logging
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -57,8 +59,7 @@ def read_mesh(path: Path, spec: SiteSpec) -> Mesh:
     suffix = path.suffix.lower()
     reader: Callable[[Path], RawMesh] = {".dae": read_collada, ".obj": read_obj}.get(suffix, _read_with_trimesh)
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):  # what they warn of is checked below
-            warnings.simplefilter("ignore")
+        with _quiet():
             raw = reader(path)
     except InputError:
         raise
@@ -109,6 +110,20 @@ def read_mesh(path: Path, spec: SiteSpec) -> Mesh:
         )
     east, north, up = (float(value) for value in shift)
     return Mesh(turned, (east, north, up), told)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the warnings of numpy and of the readers, which would stand before the sentence that the user is told."""
+    log = logging.getLogger("trimesh")
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(before)
 
 
 def _sound(part: Part) -> bool:

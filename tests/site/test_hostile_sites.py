@@ -245,3 +245,10 @@ def test_ground_of_one_line_is_no_site_and_level_ground_is_not_far_from_its_mode
     refused(tmp_path / "line.tif", ["in one line (cells: 30)"], cell_m=5.0)
     path.write_text(PLATE_OBJ.replace(" 0\n", " 4000\n"))
     refused(path, ["far from the model", "--set plane.height_m=4000"], plane={"margin_m": 20.0})
+
+
+def test_the_log_of_the_reader_is_not_shown(tmp_path, caplog):
+    facet = "facet normal 0 0 {z}\nouter loop\nvertex 0 0 0\nvertex 40 0 0\nvertex 0 40 0\nendloop\nendfacet\n"
+    (tmp_path / "plate.stl").write_text(f"solid x\n{facet.format(z='up')}endsolid x\n")
+    build(tmp_path / "plate.stl", spec(file="plate.stl"))
+    assert caplog.records == []
