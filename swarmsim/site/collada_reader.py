@@ -11,7 +11,7 @@ import numpy as np
 
 from swarmsim.config.errors import InputError
 from swarmsim.site.mesh_parts import NO_COLOUR, TRIANGLES_MAX, Floats, Part, RawMesh, to_bytes
-from swarmsim.site.polygons import triangulated
+from swarmsim.site.polygons import Cutter
 
 INSTANCES_MAX = 100_000  # nodes, with every instance of each
 
@@ -51,6 +51,8 @@ def _scene(scene: Any, path: Path) -> RawMesh:
         raise InputError.of("has no <scene>", file=path, suggestion="export it again with its scene")
     parts, lines = [], 0
     points: dict[int, Floats] = {}
+    cut: dict[int, Any] = {}
+    cutter = Cutter()
     count = 0
     left = itertools.count(INSTANCES_MAX, -1)
     for node in scene.scene.nodes:
@@ -59,7 +61,10 @@ def _scene(scene: Any, path: Path) -> RawMesh:
                 if isinstance(primitive, LineSet):
                     lines += 1
                     continue
-                triangles = _triangles(primitive, points) if hasattr(primitive, "triangleset") else primitive
+                if id(primitive) not in cut:  # instances share it
+                    has_more = hasattr(primitive, "triangleset")
+                    cut[id(primitive)] = _triangles(primitive, points, cutter) if has_more else primitive
+                triangles = cut[id(primitive)]
                 if triangles.vertex is not None and np.ndim(triangles.vertex_index) == 2:
                     bound = geometry.materialnodebysymbol.get(triangles.material)
                     material = None if bound is None else bound.target
@@ -69,8 +74,8 @@ def _scene(scene: Any, path: Path) -> RawMesh:
                     parts.append(_part(name, geometry.original, triangles, material, vertices))
                     count += len(triangles.vertex_index)
                     if count > TRIANGLES_MAX:  # `swarmsim.site.meshes` says so; instances multiply beyond all memory
-                        return RawMesh(parts, 1.0, "Y", lines)
-    return RawMesh(parts, *_unit_and_axis(scene.assetInfo.xmlnode), lines)
+                        return RawMesh(parts, 1.0, "Y", lines, cutter.crossed)
+    return RawMesh(parts, *_unit_and_axis(scene.assetInfo.xmlnode), lines, cutter.crossed)
 
 
 def _unit_and_axis(asset: Any) -> tuple[float, str]:
@@ -87,14 +92,14 @@ def _unit_and_axis(asset: Any) -> tuple[float, str]:
     return unit, axis[0] if axis in ("X_UP", "Y_UP", "Z_UP") else axis
 
 
-def _triangles(primitive: Any, points: dict[int, Floats]) -> Any:
+def _triangles(primitive: Any, points: dict[int, Floats], cutter: Cutter) -> Any:
     """The polygons of a primitive as triangles; pycollada cuts each as a fan from its first corner."""
     from collada.triangleset import TriangleSet
 
     if primitive.vertex_index is None:
         return primitive.triangleset()
     local = _source_points(primitive.sources["VERTEX"][0][4], points)
-    corners, _ = triangulated(local[primitive.vertex_index], np.asarray(primitive.vcounts, np.int64))
+    corners, _ = cutter.cut(local[primitive.vertex_index], np.asarray(primitive.vcounts, np.int64))
     return TriangleSet(primitive.sources, primitive.material, primitive.index[corners].ravel(), primitive.xmlnode)
 
 

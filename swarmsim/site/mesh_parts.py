@@ -37,6 +37,7 @@ class RawMesh:
     unit_m: float | None  # not checked; None: the file does not say
     up_axis: str | None  # X, Y or Z, or what the file says instead; None: the file does not say
     lines: int  # sets of lines or points, which are left out
+    crossed: int = 0  # faces that cross themselves, which triangles do not fill
 
 
 def to_bytes(unit: Floats) -> Bytes:

@@ -98,6 +98,11 @@ def read_mesh(path: Path, spec: SiteSpec) -> Mesh:
     turn = scale * _TO_ENU[spec.up_axis or raw.up_axis or "Z"]
     turned = [replace(part, vertices=part.vertices @ turn.T) for part in parts]
     told = [f"{raw.lines} sets of lines or points are left out: only triangles are read"] if raw.lines else []
+    if raw.crossed:
+        told.append(
+            f"faces that cross themselves: {raw.crossed}; parts of them may be left out or covered twice (triangulate "
+            "the faces on export if so)"
+        )
     shift, more = _far_off(parts, turned, scale, suffix, path)
     told += more
     if shift.any():

@@ -12,7 +12,7 @@ import numpy as np
 
 from swarmsim.config.errors import InputError
 from swarmsim.site.mesh_parts import NO_COLOUR, Floats, Part, RawMesh
-from swarmsim.site.polygons import triangulated
+from swarmsim.site.polygons import Cutter
 from swarmsim.site.source_files import material_files
 from swarmsim.site.trimesh_parts import parts_of
 
@@ -21,7 +21,8 @@ def read_obj(path: Path) -> RawMesh:
     """An OBJ file, with the names of its materials and textures even where the files that describe them are missing."""
     import trimesh
 
-    text = _plain(path.read_text(encoding="utf-8", errors="replace"), path)
+    cutter = Cutter()
+    text = _plain(path.read_text(encoding="utf-8", errors="replace"), path, cutter)
     described = "\n".join(file.read_text(encoding="utf-8", errors="replace") for file in material_files(path))
     used = set(re.findall(r"^usemtl[ \t]+(.*\S)", text, re.MULTILINE))
     bare = used - set(re.findall(r"^\s*newmtl[ \t]+(.*\S)", described, re.MULTILINE))
@@ -39,10 +40,10 @@ def read_obj(path: Path) -> RawMesh:
         colours = np.full_like(part.colours, NO_COLOUR) if part.names[0] in bare else part.colours
         return replace(part, names=tuple(dict.fromkeys(names)), colours=colours)
 
-    return replace(raw, parts=[named(part) for part in raw.parts])
+    return replace(raw, parts=[named(part) for part in raw.parts], crossed=cutter.crossed)
 
 
-def _plain(text: str, path: Path) -> str:
+def _plain(text: str, path: Path, cutter: Cutter) -> str:
     """The text of an OBJ file with triangles in place of all faces, named by numbers that count from the first vertex.
 
     trimesh cuts every face as a fan from its first corner, counts negative numbers from the end of the file and takes
@@ -84,7 +85,7 @@ def _plain(text: str, path: Path) -> str:
         raise _face_error(path, worst, f"names vertex {largest:,}, but there are {len(places):,}")
     if polygons:
         vertices = np.array([place.split()[:3] for place in places], np.float64)
-        for number, cut in zip(polygons, _cut(vertices[np.array(named) - 1], corners_of), strict=True):
+        for number, cut in zip(polygons, _cut(vertices[np.array(named) - 1], corners_of, cutter), strict=True):
             lines[number] = cut
     return "\n".join(lines)
 
@@ -99,10 +100,10 @@ def _counted(corner: str, counts: dict[str, int]) -> str:
     return "/".join(str(int(n) + 1 + count) if n.startswith("-") else n for n, count in numbers)
 
 
-def _cut(points: Floats, corners: list[list[str]]) -> Iterator[str]:
+def _cut(points: Floats, corners: list[list[str]], cutter: Cutter) -> Iterator[str]:
     """The lines with triangles for each of several faces with these ``corners``, which lie at ``points`` [c, 3]."""
     counts = np.array([len(own) for own in corners])
-    triangles, polygon = triangulated(points, counts)
+    triangles, polygon = cutter.cut(points, counts)
     within = (triangles - (np.cumsum(counts) - counts)[polygon][:, None]).tolist()
     ends = np.cumsum(np.bincount(polygon, minlength=len(corners))).tolist()
     start = 0

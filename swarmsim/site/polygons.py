@@ -1,85 +1,103 @@
 """Faces of more than three corners as triangles, concave ones included."""
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from mapbox_earcut import triangulate_float64
+from numpy.typing import NDArray
 
 from swarmsim.site.mesh_parts import Floats, Integers
 
-CONCAVE_MAX = 1000
-"""Corners of a concave face: ear clipping takes a time that grows with their square."""
-CONCAVE_TOTAL_MAX = 50_000
-"""Corners of all concave faces of a file."""
+Mask = NDArray[np.bool_]
+
+CONCAVE_MAX = 3000
+"""Corners of the concave faces of a file: the cube root of the sum of their cubes.
+
+Earcut takes a time that grows with the square of a face's corners (0.01 s for 5,000), but with their cube where the
+face crosses itself (13 s for 3,000), which is not known beforehand.
+"""
 ROUND = 8  # convex faces of more corners are halved again and again: a fan would give slivers across the whole face
-FORCED_MAX = 3  # corners clipped where there is no ear, before the rest is cut as a fan
 _FLAT = 1e-9  # of the area: smaller turns are rounding
+_FILLED = 1e-6  # of the rectangle around a face: triangles that cover so much more or less than the face fill it
 
 
 class PolygonError(ValueError):
-    """A face has too many corners to be cut into triangles; the text is a sentence for the user."""
+    """The faces have too many corners to be cut into triangles; the text is a sentence for the user."""
 
 
-def triangulated(points: Floats, counts: Integers) -> tuple[Integers, Integers]:
-    """Triangles [t, 3] that fill polygons, as rows of ``points``, and the polygon [t] of each; ordered by polygon.
+@dataclass
+class Cutter:
+    """Cuts the faces of one file into triangles."""
 
-    ``points`` [c, 3] are the corners of one polygon after the other, ``counts`` [p] how many each has. Polygons of
-    fewer than three corners are left out. Raises `PolygonError` beyond `CONCAVE_MAX` and `CONCAVE_TOTAL_MAX`.
-    """
-    first = np.cumsum(counts) - counts
-    triangles: list[Integers] = []
-    polygons: list[Integers] = []
-    concave = 0
-    for n in (int(count) for count in np.unique(counts) if count >= 3):
-        which = np.flatnonzero(counts == n)
-        own = points[first[which][:, None] + np.arange(n)]
-        fans, convex = _simple(own)
-        chosen = [(fans & ~convex, fan(n)), (convex, halved(n) if n > ROUND else fan(n))]
-        for turned in range(1, min(n, ROUND)):  # most concave faces are a fan from one of their corners
-            rest = np.flatnonzero(~fans)
-            more = np.zeros(len(own), bool)
-            more[rest] = _simple(np.roll(own[rest], -turned, axis=1))[0]
-            chosen.append((more, (fan(n) + turned) % n))
-            fans |= more
-        for mask, pattern in chosen:
-            triangles.append((first[which[mask]][:, None, None] + pattern).reshape(-1, 3))
-            polygons.append(np.repeat(which[mask], n - 2))
-        rest = np.flatnonzero(~fans)
-        concave += n * len(rest)
-        _check(n if len(rest) else 0, concave)
-        for k in rest:
-            cut = clipped(_seen_from_above(own[k]))
-            triangles.append(first[which[k]] + cut)
-            polygons.append(np.full(len(cut), which[k]))
-    if not triangles:
-        return np.empty((0, 3), np.int64), np.empty(0, np.int64)
-    polygon = np.concatenate(polygons)
-    order = np.argsort(polygon, kind="stable")
-    return np.concatenate(triangles)[order], polygon[order]
+    crossed: int = 0  # faces that triangles do not fill, since they cross themselves
+    cubes: int = 0  # of the corners of all concave faces so far
+
+    def cut(self, points: Floats, counts: Integers) -> tuple[Integers, Integers]:
+        """Triangles [t, 3] that fill polygons, as rows of ``points``, and the polygon [t] of each; ordered by polygon.
+
+        ``points`` [c, 3] are the corners of one polygon after the other, ``counts`` [p] how many each has. Polygons of
+        fewer than three corners are left out. One that crosses itself may be filled in parts, in parts twice, or not at
+        all, by up to n - 2 triangles. Raises `PolygonError` beyond `CONCAVE_MAX`.
+        """
+        first = np.cumsum(counts) - counts
+        triangles: list[Integers] = []
+        polygons: list[Integers] = []
+        for n in (int(count) for count in np.unique(counts) if count >= 3):
+            which = np.flatnonzero(counts == n)
+            # From the first corner, so that coordinates far from the origin keep their digits.
+            own = points[first[which][:, None] + np.arange(n)]
+            own -= own[:, :1].copy()
+            normal = np.cross(own[:, 1:-1], own[:, 2:]).sum(axis=1)  # Newell: twice the area, along the normal
+            # What is not finite is refused once the file is read, whatever its triangles are.
+            convex = _convex(own, normal) | ~np.isfinite(normal).all(axis=1)
+            pattern = halved(n) if n > ROUND else fan(n)
+            triangles.append((first[which[convex]][:, None, None] + pattern).reshape(-1, 3))
+            polygons.append(np.repeat(which[convex], n - 2))
+            if not convex.all():
+                rest = which[~convex]
+                corners, face = self._concave(own[~convex], normal[~convex])
+                triangles.append(first[rest[face]][:, None] + corners)
+                polygons.append(rest[face])
+        if not triangles:
+            return np.empty((0, 3), np.int64), np.empty(0, np.int64)
+        polygon = np.concatenate(polygons)
+        order = np.argsort(polygon, kind="stable")
+        return np.concatenate(triangles)[order], polygon[order]
+
+    def _concave(self, own: Floats, normal: Floats) -> tuple[Integers, Integers]:
+        """Triangles [t, 3] of polygons [p, n, 3] with normals [p, 3], as corners, and the polygon [t] of each."""
+        n = own.shape[1]
+        self.cubes += n**3 * len(own)
+        if self.cubes > CONCAVE_MAX**3:
+            raise PolygonError(
+                f"its concave faces have too many corners, one of them {n:,}: there may be one of {CONCAVE_MAX:,}, or "
+                f"1,000 of {CONCAVE_MAX // 10}"
+            )
+        seen, ends = _seen_from_above(own, normal), np.array([n], np.uint32)
+        cuts = [triangulate_float64(xy, ends) for xy in seen]
+        corners = np.concatenate(cuts).reshape(-1, 3).astype(np.int64)
+        face = np.repeat(np.arange(len(own)), [len(cut) // 3 for cut in cuts])
+        a, b, c = np.moveaxis(seen[face[:, None], corners], 1, 0)
+        doubled = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+        off = np.bincount(face, doubled, minlength=len(own)) - np.abs(normal).max(axis=1)
+        self.crossed += int((np.abs(off) > _FILLED * np.ptp(seen, axis=1).prod(axis=1)).sum())
+        return corners, face
 
 
-def _check(corners: int, total: int) -> None:
-    if corners > CONCAVE_MAX:
-        raise PolygonError(f"a concave face has {corners:,} corners, more than {CONCAVE_MAX:,}")
-    if total > CONCAVE_TOTAL_MAX:
-        raise PolygonError(f"its concave faces have more than {CONCAVE_TOTAL_MAX:,} corners in all")
-
-
-def _simple(corners: Floats) -> tuple[np.ndarray, np.ndarray]:
-    """Which polygons [p, n, 3] a fan from the first corner fills, and which of those are convex."""
-    if corners.shape[1] == 3:
-        return np.ones(len(corners), bool), np.zeros(len(corners), bool)
-    # From the first corner, so that coordinates far from the origin keep their digits.
-    own = corners - corners[:, :1]
-    normal = np.cross(own[:, 1:-1], own[:, 2:]).sum(axis=1)  # Newell: twice the area, along the normal
+def _convex(own: Floats, normal: Floats) -> Mask:
+    """Which polygons [p, n, 3], with the first corner at the origin and normals [p, 3], are convex."""
+    if own.shape[1] == 3:
+        return np.ones(len(own), bool)
     least = -_FLAT * (normal**2).sum(axis=1)[:, None]
     sides = np.roll(own, -1, axis=1) - own
 
-    def none_back(one: Floats, other: Floats) -> np.ndarray:
-        inside: np.ndarray = ((np.cross(one, other) @ normal[:, :, None])[..., 0] >= least).all(axis=1)
+    def none_back(one: Floats, other: Floats) -> Mask:
+        inside: Mask = ((np.cross(one, other) @ normal[:, :, None])[..., 0] >= least).all(axis=1)
         return inside
 
-    fans = none_back(own[:, 1:-1], own[:, 2:])
-    return fans, fans & none_back(sides, np.roll(sides, -1, axis=1))
+    # Those that turn the same way at all corners, but more than once around, have no fan from the first corner.
+    return none_back(own[:, 1:-1], own[:, 2:]) & none_back(sides, np.roll(sides, -1, axis=1))
 
 
 def fan(n: int) -> Integers:
@@ -101,76 +119,8 @@ def halved(n: int) -> Integers:
     return np.array(found)
 
 
-def _seen_from_above(corners: Floats) -> Floats:
-    """A polygon [n, 3] in the plane of its two longer axes [n, 2], counter-clockwise."""
-    own = corners - corners[0]
-    normal = np.cross(own[1:-1], own[2:]).sum(axis=0)
-    up = int(np.argmax(np.abs(normal)))
-    one, other = ((1, 2), (2, 0), (0, 1))[up]
-    return own[:, [one, other] if normal[up] >= 0.0 else [other, one]]
-
-
-def clipped(xy: Floats) -> Integers:
-    """Triangles [t, 3] of a polygon [n, 2], counter-clockwise, by clipping ears (Meisters, 1975).
-
-    A polygon that crosses itself has no right answer; it is cut into n - 2 triangles or fewer all the same.
-    """
-    n = len(xy)
-    after, before = [*range(1, n), 0], [n - 1, *range(n - 1)]
-    x, y = xy[:, 0].tolist(), xy[:, 1].tolist()
-
-    def turn(k: int) -> float:
-        a, c = before[k], after[k]
-        return (x[k] - x[a]) * (y[c] - y[a]) - (y[k] - y[a]) * (x[c] - x[a])
-
-    reflex = np.array([turn(k) < 0.0 for k in range(n)])
-
-    def is_ear(k: int) -> bool:
-        bend = turn(k)
-        return bend == 0.0 or (bend > 0.0 and _free(xy, reflex, before[k], k, after[k]))
-
-    ears = [is_ear(k) for k in range(n)]
-    found: list[tuple[int, int, int]] = []
-    k, left, passed, forced = 0, n, 0, 0
-    while left > 2:
-        if passed > left:  # no ear: looked for anew, and if there is none, the polygon crosses itself
-            ring, passed = _ring(after, k), 0
-            if forced == FORCED_MAX:
-                return np.array([*found, *np.array(ring)[fan(left)]], np.int64)
-            for i in ring:
-                ears[i] = is_ear(i)
-            if not any(ears[i] for i in ring):
-                ears[k], forced = True, forced + 1
-        a, c = before[k], after[k]
-        if not ears[k]:
-            k, passed = c, passed + 1
-            continue
-        if turn(k) != 0.0:
-            found.append((a, k, c))
-        after[a], before[c], reflex[k] = c, a, False
-        reflex[a], reflex[c] = turn(a) < 0.0, turn(c) < 0.0
-        ears[a], ears[c] = is_ear(a), is_ear(c)
-        left, passed = left - 1, 0
-        k = after[c]  # every second corner: clipping one after the other would give slivers
-    return np.array(found, np.int64).reshape(-1, 3)
-
-
-def _ring(after: list[int], start: int) -> list[int]:
-    """The corners that are left."""
-    found, k = [start], after[start]
-    while k != start:
-        found.append(k)
-        k = after[k]
-    return found
-
-
-def _free(xy: Floats, reflex: np.ndarray, a: int, b: int, c: int) -> bool:
-    """Whether the triangle a b c, counter-clockwise, holds no reflex corner other than its own."""
-    others = np.flatnonzero(reflex)
-    if len(others) == 0:
-        return True
-    p, corners = xy[others], xy[[a, b, c]]
-    way, offset = np.roll(corners, -1, axis=0) - corners, p[:, None] - corners
-    within = (way[:, 0] * offset[..., 1] - way[:, 1] * offset[..., 0] >= 0.0).all(axis=1)
-    # A hole is joined to the outline by an edge that is run twice: its corners stand there twice too.
-    return not (within & (offset != 0.0).any(axis=2).all(axis=1)).any()
+def _seen_from_above(own: Floats, normal: Floats) -> Floats:
+    """Polygons [p, n, 3] with normals [p, 3] in the planes of their two longer axes [p, n, 2], counter-clockwise."""
+    up = np.argmax(np.abs(normal), axis=1)[:, None]
+    axes = (up + np.where(np.take_along_axis(normal, up, axis=1) >= 0.0, [1, 2], [2, 1])) % 3
+    return np.take_along_axis(own, axes[:, None], axis=2)

@@ -40,8 +40,15 @@ def test_a_face_of_many_corners(tmp_path):
     raw = build(path, spec(file=path.name))
     assert time.process_time() - started < 5.0  # a fan of slivers took minutes
     assert raw.report["area_m2"] == pytest.approx(np.pi * 20.0**2, rel=0.05)
+    path.write_text(ring_obj(15.0 + 5.0 * np.cos(np.linspace(0.0, 4.0 * np.pi, 3000, endpoint=False))))
+    started = time.process_time()
+    raw = build(path, spec(file=path.name))
+    assert time.process_time() - started < 5.0
+    assert raw.report["area_m2"] == pytest.approx(np.pi * (15.0**2 + 0.5 * 5.0**2), rel=0.05)
     path.write_text(ring_obj(np.tile([20.0, 10.0], 2500)))
-    refused(path, ["concave face has 5,000 corners", "triangulate"])
+    refused(path, ["concave faces have too many corners, one of them 5,000", "triangulate"])
+    path.write_text(ring_obj(np.tile([20.0, np.nan], 2500)))
+    refused(path, ["not finite"])
 
 
 OBJ_FACES = {

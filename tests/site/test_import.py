@@ -18,7 +18,6 @@ from yards import (
     ring,
     spec,
     write_collada,
-    write_plate_dae,
     write_plate_glb,
     write_tiff,
     yard,
@@ -28,7 +27,6 @@ from swarmsim.config.errors import InputError
 from swarmsim.site import ImportOptions, import_site, load_site
 from swarmsim.site.importer import build
 from swarmsim.site.model import VisualMesh
-from swarmsim.site.polygons import triangulated
 from swarmsim.site.raster import Grid, edges_on, faces_on, highest
 from swarmsim.site.traversability import at_centres
 
@@ -333,40 +331,6 @@ def test_lines_over_a_site_end_where_a_vehicle_can_stop_before_the_fence(tmp_pat
     plate = trimesh.creation.box(extents=(side, side, 0.01))
     area = built(tmp_path, trimesh.Scene({"plate": plate})).survey_area
     assert np.all(np.abs(0.5 * side - np.abs(area) - room) < 1.1)  # to a cell
-
-
-ARROW = [(-20, -20), (20, -20), (20, 20), (0, -15), (-20, 20)]
-"""A concave face, of 900 m2: a fan from any corner but the fourth covers what lies outside."""
-
-
-@pytest.mark.parametrize("first", range(5))
-@pytest.mark.parametrize("suffix", ["obj", "dae"])
-def test_concave_faces(tmp_path, suffix, first):
-    path, corners = tmp_path / f"arrow.{suffix}", ARROW[first:] + ARROW[:first]
-    if suffix == "obj":
-        path.write_text("".join(f"v {x} {y} 0\n" for x, y in corners) + "f 1 2 3 4 5\n")
-    else:
-        points = " ".join(f"{x} {y} 0" for x, y in corners)
-        faces = "<polylist count='1'>{inputs}<vcount>5</vcount><p>0 1 2 3 4</p></polylist>"
-        write_plate_dae(path, points=points, faces=faces)
-    raw = build(path, spec(file=path.name))
-    assert raw.report["area_m2"] == pytest.approx(900.0, rel=0.05)
-    assert raw.report["triangles"] == 3
-
-
-@pytest.mark.parametrize("n", [5, 12, 200])
-def test_polygons_are_filled_by_triangles_of_their_own_sense(n):
-    rng = np.random.default_rng(n)
-    angle = (np.arange(n) + rng.uniform(0.0, 0.8, (20, n))) * 2.0 * np.pi / n
-    outline = rng.uniform(0.2, 1.0, (20, n, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    tilted = outline @ np.array([[1.0, 0.0, 0.3], [0.0, 1.0, -0.8]]) + [4e5, 5e6, 300.0]
-    triangles, polygon = triangulated(tilted.reshape(-1, 3), np.full(20, n))
-    a, b, c = np.moveaxis(outline.reshape(-1, 2)[triangles], 1, 0)
-    area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
-    after = np.roll(outline, -1, axis=1)
-    whole = 0.5 * (outline[..., 0] * after[..., 1] - outline[..., 1] * after[..., 0]).sum(axis=1)
-    assert area.min() > -1e-9
-    np.testing.assert_allclose(np.bincount(polygon, area), whole, rtol=1e-6)
 
 
 def test_numbers_of_an_obj_count_back_from_where_they_stand(tmp_path):
