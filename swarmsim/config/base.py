@@ -1,7 +1,7 @@
 """What every configuration model shares: strictness, immutability, and the small vector types."""
 
 import math
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
@@ -61,3 +61,23 @@ def _convex_counter_clockwise(points: tuple[Vec2, ...]) -> tuple[Vec2, ...]:
 ConvexPolygon = Annotated[
     tuple[Vec2, ...], Field(min_length=3, max_length=32), AfterValidator(_convex_counter_clockwise)
 ]
+
+
+def _turn(a: Vec2, b: Vec2, c: Vec2) -> float:
+    """Twice the area of a triangle, positive where it is counter-clockwise."""
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+def _without_crossings(points: tuple[Vec2, ...]) -> tuple[Vec2, ...]:
+    """The corners of a polygon; ValueError when two of its sides cross or it has no area. Sides may touch."""
+    sides = list(pairwise((*points, points[0])))
+    for (a, b), (c, d) in combinations(sides, 2):
+        if _turn(a, b, c) * _turn(a, b, d) < 0 and _turn(c, d, a) * _turn(c, d, b) < 0:
+            raise ValueError("the polygon crosses itself: give its corners in order, once around")
+    size = max(abs(x - y) for one in points for x, y in zip(one, points[0], strict=True))
+    if abs(sum(_turn(points[0], a, b) for a, b in sides)) <= 1e-9 * size**2:
+        raise ValueError("the polygon has no area: its corners lie on one line")
+    return points
+
+
+Polygon = Annotated[tuple[Vec2, ...], Field(min_length=3, max_length=32), AfterValidator(_without_crossings)]

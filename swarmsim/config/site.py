@@ -1,22 +1,11 @@
 """A site as it stands in ``configs/sites/<name>/site.yaml``."""
 
-from itertools import combinations
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from swarmsim.config.base import ConvexPolygon, Fraction, Model, Name, NonNegative, Positive, Vec2
+from swarmsim.config.base import ConvexPolygon, Fraction, Model, Name, NonNegative, Polygon, Positive
 
-
-def _with_area(points: tuple[Vec2, ...]) -> tuple[Vec2, ...]:
-    (x0, y0), size = points[0], max(abs(a[axis] - points[0][axis]) for a in points for axis in (0, 1))
-    turns = [(a[0] - x0) * (b[1] - y0) - (b[0] - x0) * (a[1] - y0) for a, b in combinations(points[1:], 2)]
-    if max(map(abs, turns)) <= 1e-9 * size**2:
-        raise ValueError("the polygon has no area: its corners lie on one line")
-    return points
-
-
-Polygon = Annotated[tuple[Vec2, ...], Field(min_length=3, max_length=32), AfterValidator(_with_area)]
 Wall = Annotated[float, Field(ge=1e-5, le=100)]  # m
 
 

@@ -2,6 +2,8 @@
 
 import re
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from swarmsim.config.site import SiteSpec
 from swarmsim.site.ground import Ground, complete_ground
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.raster import Floats, Grid
+from swarmsim.site.size_checks import check_cells, check_extent
 from swarmsim.site.visual import GROUND_COLOUR, TRIANGLES_MAX, welded
 
 SENTINELS = (-9999.0, -99999.0, -32768.0, -32767.0, 32767.0, -3.4028234663852886e38, 3.4028234663852886e38, 1e20)
@@ -47,28 +50,30 @@ def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
     Lengths are true: a projection that stretches the ground, such as Web Mercator, is scaled back at the raster's
     centre. Heights are in ``spec.height_unit_m``, or what the file says, or the unit of its projection.
     """
-    import rasterio
-
     told: list[str] = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        try:
-            with rasterio.open(path) as file:
-                _check_raster(file, path)
-                # Rows of a north-up raster run north to south; ours run south to north.
-                band = file.read(1, masked=True).astype(np.float64).filled(np.nan)[::-1]
-                band = band * float(file.scales[0]) + float(file.offsets[0])
-                matrix, crs = file.transform, file.crs
-                unit = spec.unit_m or _unit(crs, path, told)
-                height_unit = spec.height_unit_m or spec.unit_m or _height_unit(file, unit, told)
-                true = 1.0 if spec.unit_m else _true_scale(file, path, unit, told)
-        except rasterio.errors.RasterioError as error:
-            reason = str(error).splitlines()[0]
-            raise InputError.of(f"cannot be read as GeoTIFF ({reason})", file=path) from error
-    height = _with_data(np.where(np.isfinite(band), band, np.nan), height_unit, told) * height_unit
-    cell = float(matrix.a) * unit * true
+    with _opened(path) as file:
+        matrix, crs = file.transform, file.crs
+        unit, true = _scale(file, path, spec.unit_m, told)
+        height_unit = spec.height_unit_m or spec.unit_m or _height_unit(file, unit, told)
+        cell = float(matrix.a) * unit * true
+        east, north = file.width * cell, file.height * cell
+        check_extent((east, north), 0.0, path)
+        check_cells(int(east / spec.cell_m + 0.5), int(north / spec.cell_m + 0.5), spec, path)
+        # Rows of a north-up raster run north to south; ours run south to north.
+        band = file.read(1, masked=True).astype(np.float64).filled(np.nan)[::-1]
+        with np.errstate(over="ignore", invalid="ignore"):
+            band = band * float(file.scales[0]) + float(file.offsets[0])
+    band = np.where(np.isfinite(band), band, np.nan)
+    height = _with_data(band, height_unit, told) * height_unit
     ny, nx = height.shape
     if not np.isfinite(height).any():
+        if np.isfinite(band).any():
+            low, high = np.nanmin(band) * height_unit, np.nanmax(band) * height_unit
+            raise InputError.of(
+                f"holds heights of {low:.6g} to {high:.6g} m, which are none on Earth", file=path, path="height_unit_m",
+                allowed=f"heights of {-HEIGHT_MAX_M:g} to {HEIGHT_MAX_M:g} m",
+                suggestion="set height_unit_m (--height-unit) to the length of their unit in metres",
+            )  # fmt: skip
         raise InputError.of("holds no elevation: every cell is empty", file=path)
     grid = Grid((-0.5 * (nx - 1) * cell, -0.5 * (ny - 1) * cell), cell, ny, nx)
     middle = height[ny // 2, nx // 2]
@@ -84,10 +89,34 @@ def read_elevation(path: Path, spec: SiteSpec) -> Elevation:
     return Elevation(grid, height - base, photo, reference, tuple(told))
 
 
-def own_cell(path: Path) -> float:
-    """Edge length of a GeoTIFF's cells on the ground, m."""
-    spec = SiteSpec(name="elevation", file=path.name, licence="-", cell_m=1.0, max_file_mb=1e6)
-    return read_elevation(path, spec).grid.cell
+def own_cell(path: Path, unit_m: float | None = None) -> float:
+    """Edge length of a GeoTIFF's cells on the ground, m; ``unit_m`` as in `SiteSpec`."""
+    with _opened(path) as file:
+        unit, true = _scale(file, path, unit_m, [])
+        return float(file.transform.a) * unit * true
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A GeoTIFF of which an elevation model can be read; errors of GDAL are told as `InputError`."""
+    import rasterio
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        try:
+            # By its driver: GDAL would open descriptions of rasters too, which name files elsewhere.
+            with rasterio.open(path, driver="GTiff") as file:
+                _check_raster(file, path)
+                yield file
+        except rasterio.errors.RasterioError as error:
+            reason = str(error).splitlines()[0]
+            raise InputError.of(f"cannot be read as GeoTIFF ({reason})", file=path) from error
+
+
+def _scale(file: Any, path: Path, unit_m: float | None, told: list[str]) -> tuple[float, float]:
+    """Length in m of the unit of the projection, and what its metres measure on the ground."""
+    unit = unit_m or _unit(file.crs, path, told)
+    return unit, 1.0 if unit_m else _true_scale(file, path, unit, told)
 
 
 def _unit(crs: Any, path: Path, told: list[str]) -> float:
@@ -171,15 +200,18 @@ def _true_scale(file: Any, path: Path, unit: float, told: list[str]) -> float:
 
 def _with_data(height: Floats, unit: float, told: list[str]) -> Floats:
     """``height`` [ny, nx] with NaN in place of values that stand for "no data" although the file does not say so."""
-    found = np.isin(height, np.array(SENTINELS)) | np.isin(height.astype(np.float32), np.array(SENTINELS, np.float32))
+    with np.errstate(over="ignore"):
+        single = height.astype(np.float32)
+    found = np.isin(height, np.array(SENTINELS)) | np.isin(single, np.array(SENTINELS, np.float32))
     found |= np.abs(height) * unit > HEIGHT_MAX_M
-    for _ in range(2):  # the lowest value and the highest one
-        rest = np.unique(height[np.isfinite(height) & ~found])
-        for value, following, span in ((rest[:1], rest[1:2], rest[1:]), (rest[-1:], rest[-2:-1], rest[:-1])):
-            if len(span) and abs(following[0] - value[0]) * unit > max(GAP_M, np.ptp(span) * unit):
-                again = height == value[0]
-                if again.sum() > 1:
-                    found |= again
+    rest = np.unique(height[np.isfinite(height) & ~found])
+    for end in (0, -1, 0, -1):  # the lowest value and the highest one, each twice
+        value, others = rest[end:][:1], rest[1:] if end == 0 else rest[:-1]
+        if len(others) and abs(others[end] - value[0]) * unit > max(GAP_M, np.ptp(others) * unit):
+            again = height == value[0]
+            if again.sum() > 1:
+                found |= again
+                rest = others
     if not found.any():
         return height
     values = np.unique(height[found])
@@ -201,6 +233,13 @@ def _with_data(height: Floats, unit: float, told: list[str]) -> Floats:
 
 def _check_raster(file: Any, path: Path) -> None:
     matrix = file.transform
+    if not np.isfinite(tuple(matrix)).all():
+        raise InputError.of(
+            "is not georeferenced by finite numbers", file=path, given=f"transform {tuple(matrix)[:6]}",
+            suggestion="give it others, e.g. gdal_translate -a_ullr WEST NORTH EAST SOUTH IN.tif OUT.tif",
+        )  # fmt: skip
+    if file.dtypes[0].startswith("complex"):
+        raise InputError.of("holds complex numbers, not heights", file=path, suggestion="write its real part")
     if matrix.is_identity:
         raise InputError.of(
             "is not georeferenced, so the size of its cells is unknown", file=path,

@@ -54,7 +54,7 @@ def found_ground(grid: Grid, corners: Floats) -> tuple[Floats, float]:
     underlaid = 0.0
     if np.isfinite(bottom).sum() < 0.5 * np.isfinite(both_ways).sum():
         bottom = both_ways  # inverted faces: their orientation is not usable
-    else:
+    elif np.isfinite(bottom).any():
         above = _over_slab(grid, corners, hits, bottom)
         underlaid = float(np.isfinite(above).sum() / np.isfinite(bottom).sum())
         bottom = np.where(np.isfinite(above), above, bottom)
@@ -69,7 +69,7 @@ def _over_slab(grid: Grid, corners: Floats, hits: Hits, bottom: Floats) -> Float
     higher = hits.height > bottom.ravel()[hits.cell] + THICKNESS
     second = lowest(grid, Hits(hits.cell[higher], hits.height[higher], hits.triangle[higher]))
     nothing = np.full(bottom.shape, np.nan)
-    if np.isfinite(second).sum() < UNDERLAY_SHARE * np.isfinite(bottom).sum():
+    if not np.isfinite(second).any() or np.isfinite(second).sum() < UNDERLAY_SHARE * np.isfinite(bottom).sum():
         return nothing
     sheet, area = _sheets(second, grid.cell)
     largest = (sheet == np.argmax(area)).reshape(bottom.shape) & np.isfinite(second)
@@ -161,8 +161,11 @@ def _interpolated(seen: Floats, missing: Mask, outside: Mask) -> Floats:
     ring = ~missing & ndimage.binary_dilation(enclosed)
     points = np.argwhere(ring)
     if len(points) and np.linalg.matrix_rank(points - points.mean(axis=0)) == 2:
-        from scipy.interpolate import LinearNDInterpolator
+        from scipy.spatial import Delaunay
 
-        value = LinearNDInterpolator(points, seen[ring])(np.argwhere(enclosed))
-        filled[enclosed] = np.where(np.isfinite(value), value, filled[enclosed])
+        # Its LinearNDInterpolator calls LAPACK for each triangle: seconds on a machine whose cores are all taken.
+        corners = np.column_stack([points[:, ::-1], seen[ring]])[Delaunay(points).simplices]
+        hits = faces_on(Grid((0.0, 0.0), 1.0, *missing.shape), corners)
+        at = enclosed.ravel()[hits.cell]
+        filled.ravel()[hits.cell[at]] = hits.height[at]
     return filled

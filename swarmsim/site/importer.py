@@ -14,11 +14,12 @@ from swarmsim.site import traversability
 from swarmsim.site.elevation import elevation_ground, elevation_mesh, read_elevation
 from swarmsim.site.ground import THICKNESS, Ground, complete_ground, found_ground, named_ground
 from swarmsim.site.mesh_parts import NO_COLOUR, Part
-from swarmsim.site.meshes import read_mesh
+from swarmsim.site.meshes import Mesh, read_mesh
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.obstacles import Box
 from swarmsim.site.part_rules import BOXES_MAX, check_patterns, described, find_obstacles, matches, unnamed_told
 from swarmsim.site.raster import Floats, Grid, faces_on, top_of_cells
+from swarmsim.site.size_checks import check_cells, check_extent
 from swarmsim.site.source_files import TIFF_SUFFIXES, check_file
 from swarmsim.site.start_places import start_places
 from swarmsim.site.step_edges import StepRasters, find_steps
@@ -27,10 +28,12 @@ from swarmsim.site.visual import visual_mesh
 
 Mask = NDArray[np.bool_]
 
-CELLS_MAX = 4_000_000
+POINTS_MAX = 200_000_000
+"""Points on the surfaces of a mesh that are looked at: a scene of this many takes half a minute."""
 FLUSH_M = 0.02  # what rises no further above the ground does not stand on it
 COARSE_M = 0.3  # cells of the raster of clearances that a user is told of
 BARE_SHARE = 0.05  # of a site that is traversable: below it there is hardly any ground
+FAR_BELOW_M = 100.0  # level ground this far below or above a model is not under it
 PLANE = "level ground"  # name of the part that `SiteSpec.plane` adds
 
 
@@ -72,11 +75,12 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
         message = "is for elevation models: a mesh has colours of its own"
         raise InputError.of(message, path="orthophoto", given=spec.orthophoto, suggestion="leave it out")
     mesh = read_mesh(path, spec)
-    parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh.parts, spec.plane)]
+    parts = mesh.parts if spec.plane is None else [*mesh.parts, _plane(mesh, spec.plane, path)]
     check_patterns(parts, spec, path)
     corners = np.concatenate([part.corners for part in parts])
     grid = _grid_of(corners, spec, path)
     check_zones(grid, spec)
+    _check_effort(corners, grid, path)
     found = _separate(parts, corners, grid, spec, path)
     ground = found.ground
     things = find_obstacles(parts, found.bare, spec)
@@ -102,11 +106,20 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
     )  # fmt: skip
 
 
-def _plane(parts: list[Part], plane: Plane) -> Part:
+def _plane(mesh: Mesh, plane: Plane, path: Path) -> Part:
     """Level ground under the parts and around them."""
-    points = np.concatenate([part.vertices[np.unique(part.triangles), :2] for part in parts])
-    (west, south), (east, north) = points.min(axis=0) - plane.margin_m, points.max(axis=0) + plane.margin_m
-    vertices = np.array([[x, y, plane.height_m] for y in (south, north) for x in (west, east)])
+    points = np.concatenate([part.vertices[np.unique(part.triangles)] for part in mesh.parts])
+    low, high = points.min(axis=0), points.max(axis=0)
+    height = plane.height_m - mesh.shift_m[2]
+    if not low[2] - FAR_BELOW_M <= height <= high[2] + FAR_BELOW_M:
+        low_m, high_m = (round(float(value) + mesh.shift_m[2], 1) for value in (low[2], high[2]))
+        raise InputError.of(
+            f"the level ground is far from the model, which reaches from {low_m:g} m to {high_m:g} m", file=path,
+            path="plane.height_m", given=f"{plane.height_m:g} m",
+            suggestion=f"set its height (--set plane.height_m={low_m:g})",
+        )  # fmt: skip
+    (west, south), (east, north) = low[:2] - plane.margin_m, high[:2] + plane.margin_m
+    vertices = np.array([[x, y, height] for y in (south, north) for x in (west, east)])
     colours = np.tile(np.array(NO_COLOUR, np.uint8), (2, 1))
     return Part((PLANE,), vertices, np.array([[0, 1, 3], [0, 3, 2]]), colours)
 
@@ -115,7 +128,6 @@ def _from_elevation(path: Path, spec: SiteSpec) -> RawSite:
     model = read_elevation(path, spec)
     extent = model.grid.cell * np.array([model.grid.nx, model.grid.ny])
     nx, ny = (int(side) for side in np.floor(extent / spec.cell_m + 0.5))
-    check_cells(nx, ny, spec, path)
     shift = 0.5 * (spec.cell_m - model.grid.cell)
     origin = (model.grid.origin[0] + shift, model.grid.origin[1] + shift)
     grid = model.grid if spec.cell_m == model.grid.cell else Grid(origin, spec.cell_m, ny, nx)
@@ -198,6 +210,7 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
             suggestion="set up_axis (--up) to the axis that points up in the file, X, Y or Z; or, if it is a tower "
             "without its surroundings, lay level ground around it with plane (--plane 20)",
         )  # fmt: skip
+    check_extent((float(east), float(north)), float(up), path)
     if not spec.extent_m[0] <= max(east, north) <= spec.extent_m[1]:
         small = max(east, north) < spec.extent_m[0]
         units = (
@@ -216,13 +229,18 @@ def _grid_of(corners: Floats, spec: SiteSpec, path: Path) -> Grid:
     return Grid((float(low[0]) + half, float(low[1]) + half), spec.cell_m, ny, nx)
 
 
-def check_cells(nx: int, ny: int, spec: SiteSpec, path: Path) -> None:
-    """Raise `InputError` for a grid of fewer than 3 x 3 or more than `CELLS_MAX` cells."""
-    if min(nx, ny) < 3 or nx * ny > CELLS_MAX:
+def _check_effort(corners: Floats, grid: Grid, path: Path) -> None:
+    """Raise `InputError` for triangles [t, 3, 3] that take more than `POINTS_MAX` points at the finest spacing."""
+    sides = corners[:, 1:] - corners[:, :1]
+    area = 0.5 * float(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1).sum())
+    length = float(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).sum())
+    spacing = 0.5 * grid.cell / traversability.fine_factor(grid)
+    if area / spacing**2 + length / spacing > POINTS_MAX:
+        layers = area / (grid.nx * grid.ny * grid.cell**2)
         raise InputError.of(
-            f"cells of {spec.cell_m:g} m give a grid of {nx} x {ny}", file=path, path="cell_m",
-            allowed=f"at least 3 x 3 and at most {CELLS_MAX:,} cells",
-            suggestion=f"choose {'smaller' if min(nx, ny) < 3 else 'larger'} cells: cell_m (--cell)",
+            f"the surfaces of its {len(corners):,} triangles are {layers:,.0f} times as large as the site", file=path,
+            suggestion="remove copies of meshes and what is hidden inside others, decimate the mesh, or choose larger "
+            "cells: cell_m (--cell)",
         )  # fmt: skip
 
 

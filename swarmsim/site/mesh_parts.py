@@ -9,6 +9,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
+TRIANGLES_MAX = 5_000_000
+"""Triangles of a scene, with every instance of each mesh: a file of 100 MB holds 2 million."""
 NO_COLOUR = (0, 0, 0, 0)  # a part without a colour in the file; `visual_mesh` assigns one
 
 
@@ -32,9 +34,10 @@ class RawMesh:
     """A mesh file as it is written."""
 
     parts: list[Part]  # in the file's unit and axes
-    unit_m: float | None  # None: the file does not say
-    up_axis: str | None  # X, Y or Z; None: the file does not say
+    unit_m: float | None  # not checked; None: the file does not say
+    up_axis: str | None  # X, Y or Z, or what the file says instead; None: the file does not say
     lines: int  # sets of lines or points, which are left out
+    crossed: int = 0  # faces that cross themselves, which triangles do not fill
 
 
 def to_bytes(unit: Floats) -> Bytes:

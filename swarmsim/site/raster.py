@@ -10,6 +10,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 _CHUNK = 2_000_000  # candidate points per chunk; bounds the memory
+_TOLERANCE = 1e-6  # cells, and share of a triangle
 
 
 @dataclass(frozen=True)
@@ -76,27 +77,55 @@ def faces_on(grid: Grid, corners: Floats) -> Hits:
 
 def _faces(grid: Grid, corners: Floats) -> Iterator[tuple[Integers, Floats, Integers]]:
     points = grid.place(corners[..., :2])
-    size = np.array([grid.nx, grid.ny])
-    tolerance = 1e-6
-    low = np.clip(np.ceil(points.min(axis=1) - tolerance).astype(np.int64), 0, size)
-    high = np.clip(np.floor(points.max(axis=1) + tolerance).astype(np.int64), -1, size - 1)
-    span = np.maximum(high - low + 1, 0)
-    count = span.prod(axis=1)
     first, second = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
     doubled_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-    chosen = np.flatnonzero((count > 0) & (np.abs(doubled_area) > 1e-9))
-    for part in _chunks(chosen, count):
-        triangle = np.repeat(part, count[part])
-        within = np.arange(len(triangle)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
-        column = low[triangle, 0] + within % span[triangle, 0]
-        row = low[triangle, 1] + within // span[triangle, 0]
-        offset = np.stack([column, row], axis=-1) - points[triangle, 0]
-        u = (offset[:, 0] * second[triangle, 1] - offset[:, 1] * second[triangle, 0]) / doubled_area[triangle]
-        v = (first[triangle, 0] * offset[:, 1] - first[triangle, 1] * offset[:, 0]) / doubled_area[triangle]
-        hit = (u >= -tolerance) & (v >= -tolerance) & (u + v <= 1.0 + tolerance)
-        triangle, u, v = triangle[hit], u[hit], v[hit]
-        z = corners[triangle, :, 2]
-        yield (row * grid.nx + column)[hit], z[:, 0] + u * (z[:, 1] - z[:, 0]) + v * (z[:, 2] - z[:, 0]), triangle
+    low, high = _between(points.min(axis=1), points.max(axis=1), grid)
+    chosen = np.flatnonzero((high >= low).all(axis=1) & (np.abs(doubled_area) > 1e-9))
+    for part in _chunks(chosen, high[:, 1] - low[:, 1] + 1):
+        of, row = _runs(low[part, 1], high[part, 1])
+        of = part[of]
+        start, end = _ends(points[of], row)
+        left, right = (x[:, 0] for x in _between(start[:, None], end[:, None], grid))
+        for several in _chunks(np.flatnonzero(right >= left), right - left + 1):
+            line, column = _runs(left[several], right[several])
+            line = several[line]
+            triangle, rows = of[line], row[line]
+            offset = np.stack([column, rows], axis=-1) - points[triangle, 0]
+            u = (offset[:, 0] * second[triangle, 1] - offset[:, 1] * second[triangle, 0]) / doubled_area[triangle]
+            v = (first[triangle, 0] * offset[:, 1] - first[triangle, 1] * offset[:, 0]) / doubled_area[triangle]
+            hit = (u >= -_TOLERANCE) & (v >= -_TOLERANCE) & (u + v <= 1.0 + _TOLERANCE)
+            triangle, u, v = triangle[hit], u[hit], v[hit]
+            z = corners[triangle, :, 2]
+            height = z[:, 0] + u * (z[:, 1] - z[:, 0]) + v * (z[:, 2] - z[:, 0])
+            yield (rows * grid.nx + column)[hit], height, triangle
+
+
+def _between(low: Floats, high: Floats, grid: Grid) -> tuple[Integers, Integers]:
+    """First and last column and row of the grid between places [n, 1 or 2]; last < first where there is none."""
+    size = np.array([grid.nx, grid.ny])[: low.shape[1]]
+    first = np.clip(np.ceil(low - _TOLERANCE), 0, size).astype(np.int64)
+    return first, np.clip(np.floor(high + _TOLERANCE), -1, size - 1).astype(np.int64)
+
+
+def _runs(first: Integers, last: Integers) -> tuple[Integers, Integers]:
+    """All whole numbers of the runs from ``first`` [n] to ``last`` [n], after the run that each belongs to."""
+    count = last - first + 1
+    run = np.repeat(np.arange(len(first)), count)
+    return run, np.arange(len(run)) - np.repeat(np.cumsum(count) - count - first, count)
+
+
+def _ends(points: Floats, row: Integers) -> tuple[Floats, Floats]:
+    """From where to where [n] a triangle [n, 3, 2], grown by the tolerance, reaches in a row [n] of the grid."""
+    middle = points.mean(axis=1, keepdims=True)
+    grown = middle + (1.0 + 4.0 * _TOLERANCE) * (points - middle)
+    one, other = grown, np.roll(grown, -1, axis=1)
+    rise = other[..., 1] - one[..., 1]
+    off = row[:, None] - one[..., 1]
+    share = np.clip(off / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
+    x = one[..., 0] + share * (other[..., 0] - one[..., 0])
+    met = np.abs(one[..., 1] + share * rise - row[:, None]) <= _TOLERANCE
+    # An edge along the row: the two others end where it does.
+    return np.where(met, x, np.inf).min(axis=1), np.where(met, x, -np.inf).max(axis=1)
 
 
 def _chunks(chosen: Integers, count: Integers) -> Iterator[Integers]:

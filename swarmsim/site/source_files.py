@@ -1,5 +1,6 @@
 """Source files of sites: the formats that can be read, and the checks before a file is opened."""
 
+import os
 import re
 from pathlib import Path, PurePath
 
@@ -15,6 +16,8 @@ MAX_FILE_MB: float = SiteSpec.model_fields["max_file_mb"].default
 
 def check_file(path: Path, max_file_mb: float) -> None:
     """Raise `InputError` for a file that is missing, empty, too large or of an unknown format."""
+    if path.exists() and not path.is_file():
+        raise InputError.of("is not a regular file", file=path, suggestion="give a mesh or an elevation model")
     if not path.is_file():
         beside = sorted(p.name for p in path.parent.glob("*") if p.suffix.lower() in SUFFIXES)
         raise InputError.of("there is no such file", file=path, suggestion=did_you_mean(path.name, beside))
@@ -40,4 +43,5 @@ def material_files(source: Path) -> list[Path]:
         return []
     text = source.read_text(encoding="utf-8", errors="replace")
     named = [PurePath(name.strip().replace("\\", "/")).name for name in re.findall(r"^mtllib[ \t]+(.+)$", text, re.M)]
-    return [source.parent / name for name in dict.fromkeys(named) if (source.parent / name).is_file()]
+    # os.path: a name may be longer than any file's, at which Path.is_file raises.
+    return [source.parent / name for name in dict.fromkeys(named) if os.path.isfile(source.parent / name)]

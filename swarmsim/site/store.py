@@ -211,7 +211,10 @@ def import_site(
     options = options or ImportOptions()
     material_names = list(available("materials")) if material_names is None else material_names
     source, out = Path(file), Path(out_dir)
-    check_file(source, float((options.fields or {}).get("max_file_mb", MAX_FILE_MB)))
+    largest = (options.fields or {}).get("max_file_mb")
+    check_file(
+        source, largest if isinstance(largest, float | int) else MAX_FILE_MB
+    )  # the specification checks the rest
     data = _specification(source, out, options)
     told = file_errors_told("the site cannot be written there", file=out)
     with told, atomic_folder(out, partial(_check_out, overwrite=options.overwrite)) as folder:
@@ -277,11 +280,11 @@ def _with_user_file(problem: Problem, folder: Path, out: Path, source: Path) -> 
 
 def _specification(source: Path, out: Path, options: ImportOptions) -> dict[str, Any]:
     """The content of ``site.yaml``."""
+    fields = dict(options.fields or {})
     cell = options.cell_m
     if cell is None:
-        cell = _own_cell(source) if source.suffix.lower() in (".tif", ".tiff") else 0.5
-    fields = dict(options.fields or {})
-    if "orthophoto" in fields:
+        cell = _own_cell(source, fields.get("unit_m")) if source.suffix.lower() in (".tif", ".tiff") else 0.5
+    if isinstance(fields.get("orthophoto"), str):
         picture = source.parent / fields["orthophoto"]
         if not picture.is_file():
             raise InputError.of("there is no such orthophoto", file=picture, path="orthophoto")
@@ -296,7 +299,7 @@ def _specification(source: Path, out: Path, options: ImportOptions) -> dict[str,
     }
 
 
-def _own_cell(source: Path) -> float:
+def _own_cell(source: Path, unit_m: Any) -> float:
     from swarmsim.site.elevation import own_cell
 
-    return own_cell(source)
+    return own_cell(source, unit_m if isinstance(unit_m, float | int) and unit_m > 0 else None)

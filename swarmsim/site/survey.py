@@ -18,22 +18,32 @@ def survey_area(grid: Grid, inside: NDArray[np.bool_], spec: SiteSpec) -> Floats
 
     It is the specification's, or else the convex hull of the cells ``inside`` [ny, nx], inset so far that a vehicle at
     the end of a line can stop before the fence, which is the site's outline. Raises `InputError` when the
-    specification's reaches beyond the site.
+    specification's reaches beyond the site, or when the ground is a line.
     """
     if spec.survey_area_m is not None:
         return _inside_site(grid, np.array(spec.survey_area_m))
     inset = max(grid.cell, min(INSET_M, INSET_SHARE * min(grid.nx, grid.ny) * grid.cell))
     depth = ndimage.distance_transform_edt(np.pad(inside, 1))[1:-1, 1:-1] * grid.cell
-    core = depth > inset if (depth > inset).any() else inside
-    rows = np.flatnonzero(core.any(axis=1))
-    left, right = core.argmax(axis=1)[rows], grid.nx - 1 - core[:, ::-1].argmax(axis=1)[rows]
-    ends = np.concatenate([np.column_stack([left, rows]), np.column_stack([right, rows])])
-    hull = _hull(ends * grid.cell + grid.origin)
+    # On a site a few cells wide, what is left of it may be a line.
+    hull = next((hull for core in (depth > inset, inside) if len(hull := _hull_of(grid, core)) > 2), None)
+    if hull is None:
+        raise InputError.of(
+            f"there is nothing to survey: its ground lies in one line (cells: {int(inside.sum())})", file=spec.file,
+            path="cell_m", suggestion="choose smaller cells: cell_m (--cell), or check that the file is whole",
+        )  # fmt: skip
     while len(hull) > VERTICES_MAX:
         before, after = np.roll(hull, 1, axis=0) - hull, np.roll(hull, -1, axis=0) - hull
         lost = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0])
         hull = np.delete(hull, int(np.argmin(lost)), axis=0)
     return hull
+
+
+def _hull_of(grid: Grid, core: NDArray[np.bool_]) -> Floats:
+    """Convex hull [v, 2] of the centres of the cells ``core`` [ny, nx], counter-clockwise."""
+    rows = np.flatnonzero(core.any(axis=1))
+    left, right = core.argmax(axis=1)[rows], grid.nx - 1 - core[:, ::-1].argmax(axis=1)[rows]
+    ends = np.concatenate([np.column_stack([left, rows]), np.column_stack([right, rows])])
+    return _hull(ends * grid.cell + grid.origin)
 
 
 def _hull(points: Floats) -> Floats:

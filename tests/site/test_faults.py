@@ -7,22 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 from rasterio.transform import Affine
-from yards import MATERIALS, TO_Y_UP, ground_plate, spec, write_tiff, yard
+from yards import MATERIALS, TO_Y_UP, ground_plate, refused, spec, write_tiff, yard
 
 from swarmsim.config.errors import InputError
 from swarmsim.site import ImportOptions, collada_reader, import_site, load_site
 from swarmsim.site.importer import build
-
-
-def refused(path, words, **fields):
-    """The import is refused with one readable problem that holds all ``words``."""
-    with pytest.raises(InputError) as caught:
-        build(path, spec(file=path.name, **fields))
-    text = str(caught.value)
-    assert "Traceback" not in text
-    for word in words:
-        assert word in text
-    return text
 
 
 def test_missing_file_names_the_nearest(tmp_path):

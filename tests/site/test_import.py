@@ -1,11 +1,15 @@
 """Meshes and elevation models to rasters and boxes."""
 
+import time
+
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from scipy.ndimage import map_coordinates
 from yards import (
     MATERIALS,
+    PLATE_OBJ,
     TO_X_UP,
     TO_Y_UP,
     block,
@@ -326,3 +330,38 @@ def test_lines_over_a_site_end_where_a_vehicle_can_stop_before_the_fence(tmp_pat
     plate = trimesh.creation.box(extents=(side, side, 0.01))
     area = built(tmp_path, trimesh.Scene({"plate": plate})).survey_area
     assert np.all(np.abs(0.5 * side - np.abs(area) - room) < 1.1)  # to a cell
+
+
+def test_numbers_of_an_obj_count_back_from_where_they_stand(tmp_path):
+    text = PLATE_OBJ.replace("f 1 2 3", "f -4 -3 \\\n -2 # half").replace("f 1 3 4", "\tf -4 -2 -1")
+    (tmp_path / "plate.obj").write_text(text + "v 0 0 9\nv 1 0 9\nv 0 1 9\nf -3 -2 -1\n")
+    raw = build(tmp_path / "plate.obj", spec(file="plate.obj"))
+    assert raw.report["area_m2"] == pytest.approx(1600.0)
+    assert raw.terrain == pytest.approx(0.0)
+
+
+def test_many_slivers_are_found_row_by_row():
+    grid = Grid((0.5, 0.5), 1.0, 100, 100)
+    x = np.linspace(0.0, 99.0, 8001)
+    slivers = np.stack([np.stack([x[:-1], 0 * x[1:], x[1:]], -1), np.stack([x[1:], 0 * x[1:] + 100.0, x[1:]], -1)], 1)
+    corners = np.concatenate([slivers, slivers[:, :1] + [[1e-3, 0.0, 0.0]]], axis=1)
+    corners[:, 1, 0] = 99.0 - corners[:, 1, 0]
+    started = time.process_time()
+    hits = faces_on(grid, corners)
+    assert time.process_time() - started < 2.0
+    column, row = hits.cell % 100 + 0.5, hits.cell // 100 + 0.5
+    share = row / 100.0
+    assert len(hits.cell) > 300
+    np.testing.assert_allclose(column, x[hits.triangle] + share * (99.0 - x[1:] - x[:-1])[hits.triangle], atol=0.02)
+
+
+def test_textures_are_made_small_and_those_too_large_left_out(tmp_path, monkeypatch):
+    square = trimesh.Trimesh([[-20, 0, 20], [20, 0, 20], [20, 0, -20], [-20, 0, -20]], [[0, 1, 2], [0, 2, 3]])
+    picture = Image.new("RGB", (3000, 2000), (200, 10, 10))
+    square.visual = trimesh.visual.TextureVisuals(uv=np.eye(4)[:, :2], image=picture)
+    trimesh.Scene(square).export(tmp_path / "plate.glb")
+    coloured = build(tmp_path / "plate.glb", spec(file="plate.glb")).mesh.colours
+    assert {tuple(c) for c in coloured.tolist()} == {(200, 10, 10, 255)}
+    monkeypatch.setattr("swarmsim.site.trimesh_parts.PIXELS_MAX", 5_999_999)
+    plain = build(tmp_path / "plate.glb", spec(file="plate.glb")).mesh.colours
+    assert (200, 10, 10, 255) not in {tuple(c) for c in plain.tolist()}

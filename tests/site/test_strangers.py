@@ -44,7 +44,7 @@ def made(tmp_path, stranger, **more):
 
 def walls_of(stranger, model):
     """Triangles [t, 3, 3] of all that stands on the ground, in the site's frame."""
-    shift = np.array(stranger.shift_m) - [*model.report["shift_m"], 0.0]
+    shift = np.array(stranger.shift_m) - model.report["shift_m"]
     standing = [mesh.triangles for name, mesh in stranger.meshes.items() if name not in ("terrain", "Cube")]
     return np.concatenate(standing) + shift
 
@@ -55,7 +55,7 @@ def test_the_ground_is_the_same_however_the_scene_is_written(tmp_path, suffix, u
     far = UTM if suffix in ("obj", "dae") else (12.0, -7.0, 3.0)
     stranger = Stranger(meshes, unit, up, far, suffix)
     model = made(tmp_path, stranger)
-    shift = np.array(far) - [*model.report["shift_m"], 0.0]
+    shift = np.array(far) - model.report["shift_m"]
     site = model.site
     assert np.abs(np.asarray(site.origin_m)).max() < 60.0
     rng = np.random.default_rng(0)
@@ -63,6 +63,23 @@ def test_the_ground_is_the_same_however_the_scene_is_written(tmp_path, suffix, u
         column, row = np.rint((xy + shift[:2] - np.asarray(site.origin_m)) / 0.5).astype(int)
         assert site.terrain_m[row, column] == pytest.approx(height_of(meshes["terrain"], xy) + shift[2], abs=0.35)
     assert ("moved to the origin" in " ".join(model.report["warnings"])) == (far == UTM)
+
+
+@pytest.mark.parametrize(("suffix", "height"), [("obj", 4000.25), ("dae", 1e7), ("glb", -2000.0)])
+def test_a_scene_high_above_the_sea_is_moved_down(tmp_path, suffix, height):
+    house = draw(np.random.default_rng(8))
+    plain = made(tmp_path, Stranger(house, suffix=suffix))
+    moved = made(tmp_path, Stranger(house, shift_m=(0.0, 0.0, height), suffix=suffix))
+    up = moved.report["shift_m"][2]
+    assert moved.report["shift_m"][:2] == [0.0, 0.0]
+    assert np.abs(np.asarray(moved.site.terrain_m)).max() < 10.0
+    np.testing.assert_allclose(moved.site.terrain_m, plain.site.terrain_m + (height - up), atol=2e-3)
+    assert f"a height of 0 m is {up:.0f} m in the file" in " ".join(moved.report["warnings"])
+    level = {"plane": {"margin_m": 5.0, "height_m": 4010.0}}
+    alone = {"house": house["house"]}
+    if suffix == "obj":
+        planed = made(tmp_path, Stranger(alone, shift_m=(0.0, 0.0, 4010.0)), **level)
+        assert planed.site.terrain_m == pytest.approx(4010.0 - planed.report["shift_m"][2])
 
 
 def test_single_precision_far_from_the_origin_is_refused(tmp_path):

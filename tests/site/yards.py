@@ -1,13 +1,20 @@
 """Small sites and files for the tests of the site room."""
 
+import copy
+import json
+import struct
+
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import rasterio
 import trimesh
 from rasterio.transform import Affine
 
+from swarmsim.config.errors import InputError
 from swarmsim.config.site import SiteSpec
 from swarmsim.site import Obstacles, Site
+from swarmsim.site.importer import build
 from tests.generator_scripts import script
 
 polygon_prism = script("sites/mesh_shapes.py").polygon_prism
@@ -48,6 +55,17 @@ def make_site(boxes=(), terrain=None, cell=100.0, origin=(-300.0, -300.0), mater
 def spec(**fields) -> SiteSpec:
     """A specification with cells of half a metre."""
     return SiteSpec(**{"name": "here", "file": "here.glb", "licence": "made for a test", "cell_m": 0.5} | fields)
+
+
+def refused(path, words, **fields):
+    """The import is refused with one readable problem that holds all ``words``."""
+    with pytest.raises(InputError) as caught:
+        build(path, spec(file=path.name, **fields))
+    text = str(caught.value)
+    assert "Traceback" not in text
+    for word in words:
+        assert word in text
+    return text
 
 
 def ground_plate(size=(40.0, 30.0), slope=0.0, pieces=20) -> trimesh.Trimesh:
@@ -102,3 +120,52 @@ def write_tiff(path, rows, cell=5.0, **more):
     profile |= {"crs": "EPSG:32632", "transform": Affine(cell, 0.0, 500_000.0, 0.0, -cell, 5_200_000.0)} | more
     with rasterio.open(path, "w", **profile) as file:
         file.write(rows if rows.ndim == 3 else rows[None])
+
+
+PLATE_OBJ = "v -20 -20 0\nv 20 -20 0\nv 20 20 0\nv -20 20 0\nf 1 2 3\nf 1 3 4\n"
+"""A square of 40 m."""
+PLATE_POINTS = "-20 -20 0 20 -20 0 20 20 0 -20 20 0"
+PLATE_TRIANGLES = "<triangles count='2'>{inputs}<p>0 1 2 0 2 3</p></triangles>"
+PLATE_GLTF = {
+    "asset": {"version": "2.0"},
+    "scene": 0,
+    "scenes": [{"nodes": [0]}],
+    "nodes": [{"mesh": 0}],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    "accessors": [
+        {"bufferView": 0, "componentType": 5126, "count": 4, "type": "VEC3"},
+        {"bufferView": 1, "componentType": 5123, "count": 6, "type": "SCALAR"},
+    ],
+    "bufferViews": [
+        {"buffer": 0, "byteOffset": 0, "byteLength": 48},
+        {"buffer": 0, "byteOffset": 48, "byteLength": 12},
+    ],
+    "buffers": [{"byteLength": 60}],
+}
+
+
+def write_plate_glb(path, change=lambda header: None):
+    """The same square as glTF, its header changed."""
+    header = copy.deepcopy(PLATE_GLTF)
+    change(header)
+    corners = np.array([[-20, 0, 20], [20, 0, 20], [20, 0, -20], [-20, 0, -20]], "<f4")
+    data = corners.tobytes() + np.array([0, 1, 2, 0, 2, 3], "<u2").tobytes()
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x004E4942) + data
+    path.write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks)
+
+
+def write_plate_dae(path, asset="<up_axis>Z_UP</up_axis>", points=PLATE_POINTS, faces=PLATE_TRIANGLES, stride=3):
+    """The same square, or other ``faces``, as COLLADA."""
+    named = "".join(f"<param name='{axis}' type='float'/>" for axis in "XYZ")
+    path.write_text(
+        f"<COLLADA xmlns='http://www.collada.org/2005/11/COLLADASchema' version='1.4.1'><asset>{asset}</asset>"
+        f"<library_geometries><geometry id='g'><mesh><source id='s'><float_array id='a'>{points}</float_array>"
+        f"<technique_common><accessor source='#a' count='0' stride='{stride}'>{named}</accessor></technique_common>"
+        "</source><vertices id='v'><input semantic='POSITION' source='#s'/></vertices>"
+        + faces.format(inputs="<input semantic='VERTEX' source='#v' offset='0'/>")
+        + "</mesh></geometry></library_geometries><library_visual_scenes><visual_scene id='w'><node>"
+        "<instance_geometry url='#g'/></node></visual_scene></library_visual_scenes>"
+        "<scene><instance_visual_scene url='#w'/></scene></COLLADA>"
+    )
