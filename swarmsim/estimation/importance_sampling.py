@@ -14,8 +14,8 @@ normal.
 Most of a round's places lie about the mean, spread as all places are; of a ridge that bends by more than its width few
 of those are of use. The others lie each along the ridge as it runs at a likely place (a local covariance as of Elvira,
 Martino, Luengo and Corander, ICASSP 2015, 4075), as far as it is straight there. A source next to a place where a
-vehicle stood, or climbed, may lie in any direction from it, and all of a ring is likely: in two of the rounds those
-places lie around the ring through the likeliest place so far.
+vehicle stood, or climbed, may lie in any direction from it, and all of a ring is likely: in the second round those
+places lie around the ring through the likeliest place so far, and if much of it is likely in every other round.
 """
 
 from collections.abc import Callable
@@ -34,7 +34,8 @@ _EVEN = (0.8191725, 0.6710436, 0.5497005)
 FIRST_SCALES = (4.2, 2.0, 2.0, 1.0)  # standard deviations of the first round, in turn, over those that are promised
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 ABOUT_MEAN = 3  # so many of the scales are about the mean, to see the tails. The others are about likely places.
-TURNED = (1, 3)  # numbers of the rounds whose places about likely ones lie around a ring
+TURNED = 1  # number of the round whose places about likely ones lie around a ring; of a ring so do those of every other
+RING = 0.4  # of its radius: standard deviation from which on places are taken to lie on one
 PLACED_EFFECTIVE = 8.0  # weights are flattened until they count as this many when the next round is placed
 LEAST_EFFECTIVE = 16.0  # and as this many for the moments
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
@@ -122,13 +123,15 @@ def sample_posterior(
         # where walls cut it short a ridge is narrower than its curvature promises
         narrower = scaled_inverse(about + _least(about))
         if pivot is not None:
-            turn, angle = _turn(done.count, local)
-            likely = jnp.where(turn, jnp.argmax(known.log_posterior), likely)
+            best, begun = jnp.argmax(known.log_posterior), done.count == TURNED
+            turn = begun | ((done.count % 2 == TURNED % 2) & _is_ring(about, known.place[best], pivot))
+            likely = jnp.where(begun, best, likely)
             narrower = jnp.where(turn, 0.0, narrower)
         places = known.place[likely]
         ridges = _ridge(known.information[likely] + narrower, places, pivot)
         if pivot is not None:
-            places, ridges = _turned(places, ridges, pivot, angle)
+            share = (jnp.cumsum(local) - 1 + jnp.mod(done.count * _EVEN[0], 1.0)) / jnp.maximum(jnp.sum(local), 1)
+            places, ridges = _turned(places, ridges, pivot, jnp.where(turn, 2.0 * jnp.pi * share, 0.0))
         centres = jnp.where(first, starts, jnp.where(local[:, None], places, mean))
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
         scales = jnp.where(first, jnp.array(FIRST_SCALES), jnp.array(SCALES))[index % len(SCALES)]
@@ -167,15 +170,9 @@ def _ridge(information: jax.Array, places: jax.Array, pivot: jax.Array | None) -
     return jax.vmap(scaled_inverse)(information)
 
 
-def _turn(count: jax.Array, local: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Whether round ``count`` [] goes around a ring, and by which angles [P] in rad those ``local`` [P] are turned.
-
-    Those of one such round lie in between those of the other.
-    """
-    which = jnp.argmax(count == jnp.array(TURNED))
-    turn = jnp.any(count == jnp.array(TURNED))
-    share = (jnp.cumsum(local) - 1 + which / len(TURNED)) / jnp.maximum(jnp.sum(local), 1)
-    return turn, jnp.where(turn, 2.0 * jnp.pi * share, 0.0)
+def _is_ring(about: jax.Array, place: jax.Array, pivot: jax.Array) -> jax.Array:
+    """Whether [] places of covariance ``about`` [3, 3] reach far around ``pivot`` [3]; ``place`` [3] is a likely one."""
+    return jnp.trace(about[:2, :2]) > RING**2 * jnp.sum(jnp.square(place[:2] - pivot[:2]))
 
 
 def _turned(

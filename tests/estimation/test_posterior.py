@@ -95,6 +95,39 @@ def test_rounds_close_in_on_what_is_much_narrower_than_promised():
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance)[:3]), std, rtol=0.15)
 
 
+@jax.jit
+@jax.vmap
+def _of_a_ring(start, pivot, radius, width):
+    """Moments where all places at a distance from the pivot are likely, of a source about 1 m high."""
+    height = 1.0 / 0.4**2
+
+    def weigh(x):
+        offset = x - pivot
+        far = jnp.linalg.norm(offset)
+        value = -0.5 * jnp.square((far - radius) / width) - 0.5 * height * jnp.square(x[2] - 1.0)
+        along = offset / far
+        information = jnp.outer(along, along) / jnp.square(width) + jnp.diag(jnp.array([1e-4, 1e-4, height]))
+        return replace(weighed(x, value), information=information)
+
+    promised = jnp.linalg.inv(weigh(start).information)
+    return sample_posterior(weigh, start, promised, 16, 24, None, pivot)
+
+
+def test_a_ring_is_sampled_all_around():
+    """As of a source that is some metres from where a vehicle climbed: known to centimetres, and in no direction."""
+    rng = np.random.default_rng(0)
+    pivot = np.append(rng.uniform(-50.0, 50.0, (24, 2)).T, [np.full(24, 0.7)], axis=0).T
+    radius, turn = np.exp(rng.uniform(0.0, np.log(5.0), 24)), rng.uniform(0.0, 2.0 * np.pi, 24)
+    start = pivot + np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(24, 0.1)], axis=1)
+    width = radius * rng.uniform(0.03, 0.1, 24)
+    found = _of_a_ring(*(jnp.asarray(x, jnp.float32) for x in (start, pivot, radius, width)))
+    off = np.linalg.norm(np.asarray(found.mean)[:, :2] - pivot[:, :2], axis=1) / radius
+    std = np.sqrt(np.trace(np.asarray(found.covariance)[:, :2, :2], axis1=1, axis2=2)) / radius
+    assert np.all(off < 0.5), off
+    assert np.median(off) < 0.2
+    assert np.all(np.abs(std - 1.0) < 0.2), std
+
+
 def test_two_halves_that_disagree_are_told():
     """All of the posterior in a hair's breadth far from the start: the few places that come near it settle nothing."""
 
