@@ -11,27 +11,31 @@ sampling: Cornuet, Marin, Mira and Robert, Scandinavian Journal of Statistics 39
 places are worth enough independent ones. Whatever else is unknown is fitted at each place; its own spread about that is
 normal.
 
-Distributions drawn from are normal: of a ridge that bends by more than its width the ends come to weigh too late. Of
-arcs with a radius of 12 m, known to 3 m along them, 92 % of the 95 % regions cover the truth where they are 0.6 m wide,
-85 % where it is 0.3 m and 72 % where it is 0.15 m (standard deviations).
+Most of a round's places lie about the mean, spread as all places are; of a ridge that bends by more than its width few
+of those are of use. The others lie each along the ridge as it runs at a likely place (a local covariance as of Elvira,
+Martino, Luengo and Corander, ICASSP 2015, 4075), as far as it is straight there. A source next to a place where a
+vehicle stood, or climbed, may lie in any direction from it, and all of a ring is likely: in the second round those
+places lie around the ring through the likeliest place so far, and if much of it is likely in every other round.
 """
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 
 from swarmsim.device import each, repeat_while
+from swarmsim.estimation.likelihood import scaled_inverse
 from swarmsim.estimation.search import TOGETHER
 from swarmsim.pytree import pytree
 
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
 # "The unreasonable effectiveness of quasirandom sequences", 2018).
 _EVEN = (0.8191725, 0.6710436, 0.5497005)
-FIRST_SPREAD = 2.0  # standard deviations of the first round over those that the curvature promises
-SCALES = (2.5, 1.2, 1.2, 0.6)  # spread of a round's places, in turn, over that of the places weighed so far
+FIRST_SCALES = (4.2, 2.0, 2.0, 1.0)  # standard deviations of the first round, in turn, over those that are promised
+SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 ABOUT_MEAN = 3  # so many of the scales are about the mean, to see the tails. The others are about likely places.
+TURNED = 1  # number of the round whose places about likely ones lie around a ring; of a ring so do those of every other
+RING = 0.4  # of its radius: standard deviation from which on places are taken to lie on one
 PLACED_EFFECTIVE = 8.0  # weights are flattened until they count as this many when the next round is placed
 LEAST_EFFECTIVE = 16.0  # and as this many for the moments
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
@@ -48,6 +52,7 @@ class Weighed:
     log_activity: jax.Array  # [...] of the best fit there
     variance: jax.Array  # [...] of the logarithm of the activity, the place held
     log_posterior: jax.Array  # [...]
+    information: jax.Array  # [..., 3, 3] about the place, by the curvature there; as if nothing were in the way
 
 
 @pytree
@@ -66,7 +71,7 @@ class _Rounds:
 
     known: Weighed  # [Q, P]
     centres: jax.Array  # [Q, P, 3]
-    roots: jax.Array  # [Q, 3, 3] of the covariance
+    inverse: jax.Array  # [Q, P, 3, 3] of the lower triangular root of the covariance
     mixture: jax.Array  # [Q, P] log density of all distributions together
     count: jax.Array  # [] int32 rounds done
 
@@ -78,50 +83,65 @@ def sample_posterior(
     rounds: int,
     per_round: int,
     others: jax.Array | None = None,
+    pivot: jax.Array | None = None,
 ) -> Posterior:
     """Moments of the posterior around ``start`` [3], whose covariance near it is about ``covariance`` [3, 3].
 
     ``weigh`` gives the posterior at a place [3]. There are ``rounds`` of ``per_round`` places at most. Half of the
-    first ones lie about ``others`` [m, 3], in turn, where there may be further modes.
+    first ones lie about ``others`` [m, 3], in turn, where there may be further modes. What is likely may lie around
+    ``pivot`` [3] on a ring; without one there is none, and ridges are taken to be straight.
     """
-    index = jnp.arange(per_round)[:, None]
-    starts = start if others is None else jnp.where(index % 2, others[index[:, 0] // 2 % len(others)], start)
+    index = jnp.arange(per_round)
+    starts = start if others is None else jnp.where((index % 2)[:, None], others[index // 2 % len(others)], start)
     even = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(_EVEN), 1.0)
     normal = jax.scipy.special.ndtri(jnp.clip(even, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
-    scales = _scales(per_round)
+    local = index % len(SCALES) >= ABOUT_MEAN
 
     # The places of rounds to come have no weight yet, and their distributions no density.
-    none = jnp.zeros((rounds, per_round))
+    none, eye = jnp.zeros((rounds, per_round)), jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
     empty = Weighed(
         place=jnp.zeros((rounds, per_round, 3)),
         log_activity=none,
         variance=none,
         log_posterior=jnp.full((rounds, per_round), -jnp.inf),
+        information=eye,
     )
     nowhere = _Rounds(
         known=empty,
         centres=jnp.zeros((rounds, per_round, 3)),
-        roots=jnp.broadcast_to(jnp.eye(3), (rounds, 3, 3)),
+        inverse=eye,
         mixture=jnp.full((rounds, per_round), -jnp.inf),
         count=jnp.int32(0),
     )
 
     def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
-        """Centres and the covariance of the next round."""
+        """Centres [P, 3] and covariances [P, 3, 3] of the next round."""
+        known, first = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), done.known), ~_any_weight(done)
         weight = flattened(_log_weights(done), PLACED_EFFECTIVE)
         mean, about = _moments(done.known.place, weight)
-        likely = drawn_evenly(done.known.place.reshape(-1, 3), weight.reshape(-1), per_round)
-        wide = jnp.arange(per_round)[:, None] % len(SCALES) < ABOUT_MEAN
-        first = ~_any_weight(done)
-        centres = jnp.where(first, starts, jnp.where(wide, mean, likely))
-        return centres, jnp.where(first, (FIRST_SPREAD / SCALES[1]) ** 2 * covariance, about)
+        likely = drawn_evenly(weight.reshape(-1), per_round)
+        # where walls cut it short a ridge is narrower than its curvature promises
+        narrower = scaled_inverse(about + _least(about))
+        if pivot is not None:
+            best, begun = jnp.argmax(known.log_posterior), done.count == TURNED
+            turn = begun | ((done.count % 2 == TURNED % 2) & _is_ring(about, known.place[best], pivot))
+            likely = jnp.where(begun, best, likely)
+            narrower = jnp.where(turn, 0.0, narrower)
+        places = known.place[likely]
+        ridges = _ridge(known.information[likely] + narrower, places, pivot)
+        if pivot is not None:
+            share = (jnp.cumsum(local) - 1 + jnp.mod(done.count * _EVEN[0], 1.0)) / jnp.maximum(jnp.sum(local), 1)
+            places, ridges = _turned(places, ridges, pivot, jnp.where(turn, 2.0 * jnp.pi * share, 0.0))
+        centres = jnp.where(first, starts, jnp.where(local[:, None], places, mean))
+        spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
+        scales = jnp.where(first, jnp.array(FIRST_SCALES), jnp.array(SCALES))[index % len(SCALES)]
+        return centres, jnp.square(scales)[:, None, None] * spread
 
     def round_(done: _Rounds) -> _Rounds:
-        k = done.count
-        centres, about = placed(done)
-        root = jnp.linalg.cholesky(about + (LEAST_STD_M**2 + LEAST_SHARE**2 * jnp.trace(about)) * jnp.eye(3))
-        drawn = each(weigh, centres + scales[:, None] * (normal[k] @ root.T), TOGETHER)
-        return _with_round(done, drawn, centres, root)
+        centres, covariances = placed(done)
+        roots = jnp.linalg.cholesky(covariances + _least(covariances))
+        drawn = each(weigh, centres + jnp.einsum("pij,pj->pi", roots, normal[done.count]), TOGETHER)
+        return _with_round(done, drawn, centres, roots)
 
     def more(done: _Rounds) -> jax.Array:
         enough = _worth(done) >= ENOUGH_EFFECTIVE
@@ -129,6 +149,40 @@ def sample_posterior(
 
     done = repeat_while(more, round_, nowhere)
     return _summary(done)
+
+
+def _least(covariance: jax.Array) -> jax.Array:
+    """What makes covariances [..., 3, 3] positive, and none of their standard deviations too small."""
+    least = LEAST_STD_M**2 + LEAST_SHARE**2 * jnp.trace(covariance, axis1=-2, axis2=-1)
+    return least[..., None, None] * jnp.eye(3)
+
+
+def _ridge(information: jax.Array, places: jax.Array, pivot: jax.Array | None) -> jax.Array:
+    """Covariances [P, 3, 3] of ``places`` [P, 3] about which the posterior has so much ``information`` [P, 3, 3].
+
+    A ring of radius R about the pivot leaves its tangent by w, the width of the ridge, within sqrt(2 R w): no standard
+    deviation is longer.
+    """
+    if pivot is not None:
+        radius = jnp.maximum(jnp.linalg.norm(places - pivot, axis=1), LEAST_STD_M)
+        bend = 0.5 * jnp.sqrt(jnp.trace(information, axis1=1, axis2=2)) / radius
+        information = information + bend[:, None, None] * jnp.eye(3)
+    return jax.vmap(scaled_inverse)(information)
+
+
+def _is_ring(about: jax.Array, place: jax.Array, pivot: jax.Array) -> jax.Array:
+    """Whether [] places of covariance ``about`` [3, 3] reach far around ``pivot`` [3]; ``place`` [3] is a likely one."""
+    return jnp.trace(about[:2, :2]) > RING**2 * jnp.sum(jnp.square(place[:2] - pivot[:2]))
+
+
+def _turned(
+    places: jax.Array, covariances: jax.Array, pivot: jax.Array, angle: jax.Array
+) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    """Places [P, 3] and covariances [P, 3, 3] turned about the vertical through ``pivot`` [3] by angles [P] in rad."""
+    c, s, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
+    turn = jnp.stack([jnp.stack([c, -s, zero]), jnp.stack([s, c, zero]), jnp.stack([zero, zero, zero + 1.0])])
+    offset = places - pivot
+    return pivot + jnp.einsum("ijp,pj->pi", turn, offset), jnp.einsum("ijp,pjk,lkp->pil", turn, covariances, turn)
 
 
 def _summary(done: _Rounds) -> Posterior:
@@ -145,17 +199,13 @@ def _summary(done: _Rounds) -> Posterior:
     )
 
 
-def _scales(per_round: int) -> jax.Array:
-    return jnp.array(SCALES)[jnp.arange(per_round) % len(SCALES)]
-
-
-def drawn_evenly(places: jax.Array, weight: jax.Array, count: int) -> jax.Array:
-    """``count`` of the places [N, 3], each as often as its weight [N] says (systematic resampling, Kitagawa 1996)."""
+def drawn_evenly(weight: jax.Array, count: int) -> jax.Array:
+    """Numbers [count] of places, each as often as its weight [N] says (systematic resampling, Kitagawa 1996)."""
     at = (jnp.arange(count) + 0.5) / count
     index = jnp.searchsorted(jnp.cumsum(weight), at)
     # neighbours in the order of the places have different scales
     turned = jnp.argsort(jnp.mod(jnp.arange(count) * _EVEN[0], 1.0))
-    return places[jnp.minimum(index, places.shape[0] - 1)][turned]
+    return jnp.minimum(index, weight.shape[0] - 1)[turned]
 
 
 def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, drawn: jax.Array) -> jax.Array:
@@ -172,32 +222,45 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, dr
     return jnp.max(apart)
 
 
-def _with_round(done: _Rounds, drawn: Weighed, centres: jax.Array, root: jax.Array) -> _Rounds:
-    """The rounds and one more: places [P], and the distribution that they were drawn from."""
+def _with_round(done: _Rounds, drawn: Weighed, centres: jax.Array, roots: jax.Array) -> _Rounds:
+    """The rounds and one more: places [P], and the normal distributions that they were drawn from.
+
+    ``centres`` [P, 3] and lower triangular ``roots`` [P, 3, 3] of the covariances.
+    """
     k = done.count
     known = jax.tree.map(lambda all_, new: all_.at[k].set(new), done.known, drawn)
-    centres, roots = done.centres.at[k].set(centres), done.roots.at[k].set(root)
-    # the new distribution at all places, and those before it at the new places: the rest is known
+    eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
+    inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
+    # the new distributions at all places, and those before them at the new places: the rest is known
     places = known.place.reshape(-1, 3)
-    of_new = _log_density(places, places[0], centres[k], root).reshape(known.log_posterior.shape)
-    before = jax.vmap(partial(_log_density, drawn.place, places[0]))(centres, roots)
-    before = jnp.where(jnp.arange(len(roots))[:, None] < k, before, -jnp.inf)
-    mixture = done.mixture.at[k].set(jax.scipy.special.logsumexp(before, axis=0))
-    return _Rounds(known=known, centres=centres, roots=roots, mixture=jnp.logaddexp(mixture, of_new), count=k + 1)
+    of_new = _log_density(places, places[0], centres, inverse).reshape(known.log_posterior.shape)
+    earlier = jnp.repeat(jnp.arange(len(done.centres)) < k, len(centres))
+    before = _log_density(
+        drawn.place, places[0], done.centres.reshape(-1, 3), done.inverse.reshape(-1, 3, 3), earlier
+    )  # fmt: skip
+    mixture = done.mixture.at[k].set(before)
+    return _Rounds(
+        known=known,
+        centres=done.centres.at[k].set(centres),
+        inverse=done.inverse.at[k].set(inverse),
+        mixture=jnp.logaddexp(mixture, of_new),
+        count=k + 1,
+    )
 
 
-def _log_density(places: jax.Array, origin: jax.Array, centres: jax.Array, root: jax.Array) -> jax.Array:
-    """Log density [m] of a round's distribution at ``places`` [m, 3], up to a constant.
+def _log_density(
+    places: jax.Array, origin: jax.Array, centres: jax.Array, inverse: jax.Array, drawn: jax.Array | bool = True
+) -> jax.Array:
+    """Log density [m] at ``places`` [m, 3] of the normal distributions that are ``drawn`` [n] from, up to a constant.
 
-    Those and its ``centres`` [P, 3] are taken relative to ``origin`` [3]: large coordinates would lose digits in
-    float32.
+    Those and the ``centres`` [n, 3] are taken relative to ``origin`` [3]: large coordinates would lose digits in
+    float32. ``inverse`` [n, 3, 3] are those of the roots.
     """
-    scales = _scales(centres.shape[0])
-    inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(3), lower=True)
-    turned = (places - origin) @ inverse.T
-    offset = (turned[:, None] - (centres - origin) @ inverse.T) / scales[:, None]
-    each_ = -0.5 * jnp.sum(offset * offset, axis=-1) - 3.0 * jnp.log(scales)
-    return jax.scipy.special.logsumexp(each_, axis=-1) - jnp.sum(jnp.log(jnp.diagonal(root)))
+    offset = (places - origin)[:, None] - (centres - origin)
+    turned = [sum(inverse[:, i, j] * offset[..., j] for j in range(i + 1)) for i in range(3)]
+    sharp = jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=1, axis2=2)), axis=1)
+    each_ = sharp - 0.5 * sum(jnp.square(x) for x in turned)
+    return jax.scipy.special.logsumexp(jnp.where(drawn, each_, -jnp.inf), axis=1)
 
 
 def _log_weights(done: _Rounds) -> jax.Array:

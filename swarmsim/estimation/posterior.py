@@ -23,6 +23,7 @@ from swarmsim.estimation.search import (
     TOGETHER,
     attempt,
     bounds,
+    heard_most_at,
     looked_at,
     mirrored_place,
     screen_of,
@@ -118,6 +119,9 @@ def _posterior(
     u, nuclide = replace(state.unknowns, activity_bq=s.activity_bq[k]), s.nuclide[k]
     rate = problem.learning_rate
 
+    known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
+    known = known.at[2].set(height_precision(problem.height_std_m))
+
     def weigh(place: jax.Array) -> Weighed:
         fit = settle(problem, ways_from(problem, place), nuclide, others, u, WEIGH_STEPS, exact=False)
         of_height = 0.5 * height_precision(problem.height_std_m) * jnp.square(place[2] - problem.height_m)
@@ -127,13 +131,13 @@ def _posterior(
             log_activity=jnp.log(jnp.maximum(fit.unknowns.activity_bq, 1e-3)),
             variance=fit.covariance[0, 0] / rate,
             log_posterior=jnp.where(inside, rate * fit.value - (1.0 - rate) * of_height, -jnp.inf),
+            information=rate * fit.towards + jnp.diag(known),
         )
 
-    known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
-    known = known.at[2].set(height_precision(problem.height_std_m))
     covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
     modes, beside = some_at_a_time(lambda: _around(problem, state, k, others, u))
-    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, modes), beside
+    pivot = heard_most_at(problem, s.place[k], jnp.sum(state.added.counts[k], axis=1))
+    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, modes, pivot), beside
 
 
 def _around(
@@ -151,9 +155,7 @@ def _around(
     scouts = spread(place, jnp.asarray(SCOUTED_M), HEIGHTS * problem.height_std_m, SCOUTS, jnp.zeros(()))
     scouts = jnp.clip(jnp.concatenate([scouts, place + _ring()]), *bounds(problem))
     seen, told = each(lambda x: looked_at(quick, screen, nuclide, x), scouts, TOGETHER)
-    likely = drawn_evenly(
-        scouts[:SCOUTS], flattened(problem.learning_rate * seen[:SCOUTS], LEAST_SCOUTS), MODES
-    )  # fmt: skip
+    likely = scouts[drawn_evenly(flattened(problem.learning_rate * seen[:SCOUTS], LEAST_SCOUTS), MODES)]
     beside = jnp.sort(told[SCOUTS:])[int(SHARE_BESIDE * PLACES_BESIDE)]
 
     def nearer(_: int, at: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from swarmsim.device import each
 from swarmsim.estimation.fit import Settled, settle
 from swarmsim.estimation.forward import Problem, Rates, rates, ways_from, with_one_ray
-from swarmsim.estimation.likelihood import height_precision, scaled_inverse
+from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.normal_equations import (
     MEAN_FLOOR,
     Others,
@@ -25,6 +25,7 @@ from swarmsim.estimation.normal_equations import (
     of_window,
 )
 from swarmsim.pytree import pytree
+from swarmsim.site import sample
 from swarmsim.site.model import bounds_m
 
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
@@ -230,8 +231,7 @@ def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax
     fits the windows' places best, weighted with the squares of the counts, so that it is the part next to the source.
     """
     m = problem.measurements
-    weight = jnp.square(jnp.where(m.valid, counts / jnp.maximum(jnp.max(counts), 1e-9), 0.0))
-    weight = weight / jnp.maximum(jnp.sum(weight), 1e-9)
+    weight = _shares_of(problem, counts)
     offset = jnp.where(m.valid[:, None], m.position_m[:, :2] - place[:2], 0.0)
     middle = weight @ offset
     apart = jnp.where(m.valid[:, None], offset - middle, 0.0)
@@ -239,6 +239,25 @@ def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax
     angle = 0.5 * jnp.arctan2(2.0 * xy, xx - yy)
     across = jnp.stack([-jnp.sin(angle), jnp.cos(angle)])
     return place.at[:2].add(2.0 * jnp.dot(middle, across) * across)
+
+
+def heard_most_at(problem: Problem, place: jax.Array, counts: jax.Array) -> jax.Array:
+    """Where [3] (x, y, height above the ground) most of a source's ``counts`` [n] came from.
+
+    The mean of the windows' places, weighted as by `mirrored_place`; ``place`` [3] is the source's.
+    """
+    m = problem.measurements
+    offset = jnp.where(m.valid[:, None], m.position_m - position_of(problem.site, place), 0.0)
+    found = position_of(problem.site, place) + _shares_of(problem, counts) @ offset
+    return found.at[2].add(-sample(problem.site.terrain_m, problem.site, found[:2]))
+
+
+def _shares_of(problem: Problem, counts: jax.Array) -> jax.Array:
+    """Shares [n] of the windows, as the squares of their ``counts`` [n]; 0 of those that are not valid."""
+    weight = jnp.square(
+        jnp.where(problem.measurements.valid, counts / jnp.maximum(jnp.max(counts), 1e-9), 0.0)
+    )  # fmt: skip
+    return weight / jnp.maximum(jnp.sum(weight), 1e-9)
 
 
 def best_of(

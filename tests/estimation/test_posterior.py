@@ -14,7 +14,7 @@ from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.importance_sampling import (
-    SCALES,
+    FIRST_SCALES,
     Weighed,
     _log_weights,
     _Rounds,
@@ -34,6 +34,14 @@ SPANS = ((0, 231, 0, 1),)
 CO_60 = jnp.int32(0)
 
 
+def weighed(place, log_posterior, log_activity=0.0, variance=0.0):
+    """A place [3] of a posterior as wide as a metre."""
+    return Weighed(
+        place=place, log_activity=jnp.asarray(log_activity), variance=jnp.asarray(variance),
+        log_posterior=log_posterior, information=jnp.eye(3),
+    )  # fmt: skip
+
+
 @jax.jit
 def _of_a_normal(mean, covariance, slope, variance, start, guess):
     """Moments where the posterior of the place is normal, and the activity's logarithm linear in the place."""
@@ -42,8 +50,9 @@ def _of_a_normal(mean, covariance, slope, variance, start, guess):
     def weigh(x):
         offset = x - mean
         return Weighed(
-            place=x, log_activity=slope @ offset, variance=variance, log_posterior=-0.5 * offset @ inverse @ offset
-        )
+            place=x, log_activity=slope @ offset, variance=variance, log_posterior=-0.5 * offset @ inverse @ offset,
+            information=inverse,
+        )  # fmt: skip
 
     return sample_posterior(weigh, start, guess, 6, 64)
 
@@ -75,13 +84,48 @@ def test_rounds_close_in_on_what_is_much_narrower_than_promised():
 
     def weigh(place):
         off = (place - mean) / std
-        return Weighed(place=place, log_activity=zero, variance=zero, log_posterior=-0.5 * jnp.sum(jnp.square(off)))
+        value = -0.5 * jnp.sum(jnp.square(off))
+        return Weighed(place=place, log_activity=zero, variance=zero, log_posterior=value, information=promised)
 
     start, guess = jnp.array([1.3, 1.7, 0.6]), jnp.diag(jnp.square(jnp.array([2.0, 1.6, 0.8])))
+    promised = jnp.linalg.inv(guess)
     found = jax.jit(lambda: sample_posterior(weigh, start, guess, 7, 24))()
     assert float(found.effective) >= 40.0
     np.testing.assert_allclose(found.mean[:3], mean, atol=0.2 * std.max())
     np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance)[:3]), std, rtol=0.15)
+
+
+@jax.jit
+@jax.vmap
+def _of_a_ring(start, pivot, radius, width):
+    """Moments where all places at a distance from the pivot are likely, of a source about 1 m high."""
+    height = 1.0 / 0.4**2
+
+    def weigh(x):
+        offset = x - pivot
+        far = jnp.linalg.norm(offset)
+        value = -0.5 * jnp.square((far - radius) / width) - 0.5 * height * jnp.square(x[2] - 1.0)
+        along = offset / far
+        information = jnp.outer(along, along) / jnp.square(width) + jnp.diag(jnp.array([1e-4, 1e-4, height]))
+        return replace(weighed(x, value), information=information)
+
+    promised = jnp.linalg.inv(weigh(start).information)
+    return sample_posterior(weigh, start, promised, 16, 24, None, pivot)
+
+
+def test_a_ring_is_sampled_all_around():
+    """As of a source that is some metres from where a vehicle climbed: known to centimetres, and in no direction."""
+    rng = np.random.default_rng(0)
+    pivot = np.append(rng.uniform(-50.0, 50.0, (24, 2)).T, [np.full(24, 0.7)], axis=0).T
+    radius, turn = np.exp(rng.uniform(0.0, np.log(5.0), 24)), rng.uniform(0.0, 2.0 * np.pi, 24)
+    start = pivot + np.stack([radius * np.cos(turn), radius * np.sin(turn), np.full(24, 0.1)], axis=1)
+    width = radius * rng.uniform(0.03, 0.1, 24)
+    found = _of_a_ring(*(jnp.asarray(x, jnp.float32) for x in (start, pivot, radius, width)))
+    off = np.linalg.norm(np.asarray(found.mean)[:, :2] - pivot[:, :2], axis=1) / radius
+    std = np.sqrt(np.trace(np.asarray(found.covariance)[:, :2, :2], axis1=1, axis2=2)) / radius
+    assert np.all(off < 0.5), off
+    assert np.median(off) < 0.2
+    assert np.all(np.abs(std - 1.0) < 0.2), std
 
 
 def test_two_halves_that_disagree_are_told():
@@ -89,7 +133,7 @@ def test_two_halves_that_disagree_are_told():
 
     def weigh(x):
         far = -0.5 * jnp.sum(jnp.square((x - 2.5) / 0.02))
-        return Weighed(place=x, log_activity=x[0], variance=jnp.float32(0.01), log_posterior=far)
+        return weighed(x, far, x[0], jnp.float32(0.01))
 
     found = jax.jit(lambda: sample_posterior(weigh, jnp.zeros(3), jnp.eye(3), 1, 64))()
     assert float(found.effective) < 16.0
@@ -101,8 +145,7 @@ def two_modes(turn):
 
     def weigh(x):
         modes = jnp.stack([-0.5 * jnp.sum(x * x) + jnp.log(0.7), -0.5 * jnp.sum(jnp.square(x - other)) + jnp.log(0.3)])
-        zero = jnp.zeros(())
-        return Weighed(place=x, log_activity=zero, variance=zero, log_posterior=jax.scipy.special.logsumexp(modes))
+        return weighed(x, jax.scipy.special.logsumexp(modes))
 
     return weigh
 
@@ -124,9 +167,9 @@ def test_a_few_places_that_outweigh_all_others_are_not_worth_many():
     value = np.full((40, 24), -np.inf)
     value[:5] = np.log(weight).reshape(5, 24)
     zero = jnp.zeros((40, 24))
-    known = Weighed(place=jnp.zeros((40, 24, 3)), log_activity=zero, variance=zero, log_posterior=jnp.float32(value))
-    roots = jnp.broadcast_to(jnp.eye(3), (40, 3, 3))
-    done = _Rounds(known=known, centres=known.place, roots=roots, mixture=zero, count=jnp.int32(5))
+    eye = jnp.broadcast_to(jnp.eye(3), (40, 24, 3, 3))
+    known = replace(weighed(jnp.zeros((40, 24, 3)), jnp.float32(value), zero, zero), information=eye)
+    done = _Rounds(known=known, centres=known.place, inverse=eye, mixture=zero, count=jnp.int32(5))
     assert float(_worth(done)) < 5.0
 
 
@@ -138,8 +181,7 @@ def _of_two_places(turn):
 
     def weigh(x):
         far = jnp.abs(x @ across) > 25.0
-        zero = jnp.zeros(())
-        return Weighed(place=x, log_activity=zero, variance=zero, log_posterior=jnp.where(far, 0.0, -jnp.inf))
+        return weighed(x, jnp.where(far, 0.0, -jnp.inf))
 
     return sample_posterior(weigh, jnp.zeros(3), jnp.diag(jnp.array([100.0, 100.0, 0.01])), 4, 8)
 
@@ -157,7 +199,7 @@ def test_modes_of_either_kind_are_drawn_about_at_several_scales():
     modes = in_pairs(likely, mirrored)
     index = np.arange(1, 24, 2)  # of a round's places, those about modes
     of_mirrored = np.all(np.asarray(modes)[index // 2 % len(modes)] == 0.0, axis=1)
-    scale = np.array(SCALES)[index % len(SCALES)]
+    scale = np.array(FIRST_SCALES)[index % len(FIRST_SCALES)]
     assert of_mirrored.sum() == 6
     assert len(set(scale[of_mirrored])) > 1
     assert len(set(scale[~of_mirrored])) > 1
@@ -276,7 +318,7 @@ def test_a_posterior_of_which_no_place_was_found_is_worth_nothing(none):
     start = jnp.array([50.0, 60.0, 1.0])
 
     def weigh(x):
-        return Weighed(place=x, log_activity=x[0], variance=jnp.float32(0.01), log_posterior=jnp.float32(none))
+        return weighed(x, jnp.float32(none), x[0], jnp.float32(0.01))
 
     found = jax.jit(lambda: sample_posterior(weigh, start, jnp.eye(3), 6, 40))()
     assert float(found.effective) == 0.0
@@ -289,6 +331,7 @@ def test_a_place_without_weight_may_have_any_values():
         return Weighed(
             place=x, log_activity=jnp.where(there, x[0], jnp.nan), variance=jnp.where(there, 0.01, jnp.inf),
             log_posterior=jnp.where(there, -0.5 * jnp.sum(x * x), -jnp.inf),
+            information=jnp.where(there, 1.0, jnp.nan) * jnp.eye(3),
         )  # fmt: skip
 
     found = jax.jit(lambda: sample_posterior(weigh, jnp.zeros(3), jnp.eye(3), 6, 40))()
@@ -329,29 +372,24 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
     rng = np.random.default_rng(0)
     rounds, per_round, drawn = 6, 16, 4
     none = jnp.zeros((rounds, per_round))
-    empty = Weighed(
-        place=jnp.zeros((rounds, per_round, 3)), log_activity=none, variance=none, log_posterior=none - jnp.inf
-    )
+    eye = jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
+    empty = replace(weighed(jnp.zeros((rounds, per_round, 3)), none - jnp.inf, none, none), information=eye)
     done = _Rounds(
-        known=empty, centres=empty.place, roots=jnp.broadcast_to(jnp.eye(3), (rounds, 3, 3)),
-        mixture=none - jnp.inf, count=jnp.int32(0),
+        known=empty, centres=empty.place, inverse=eye, mixture=none - jnp.inf, count=jnp.int32(0)
     )  # fmt: skip
     places, centres, roots = [], [], []
     for _ in range(drawn):
         # far from the origin of the site, and from one round to the next
         centres.append((rng.normal(size=(per_round, 3)) * 2.0 + [3000.0, -2000.0, 1.0]).astype(np.float32))
-        roots.append((np.tril(rng.normal(size=(3, 3)) * 0.2) + np.diag([0.7, 1.0, 0.5])).astype(np.float32))
+        lower = np.tril(rng.normal(size=(per_round, 3, 3)) * 0.1) + np.diag([0.7, 1.0, 0.5])
+        roots.append((rng.choice([0.6, 1.2, 2.5], (per_round, 1, 1)) * lower).astype(np.float32))
         places.append((centres[-1] + rng.normal(size=(per_round, 3))).astype(np.float32))
-        new = Weighed(
-            place=jnp.asarray(places[-1]), log_activity=none[0], variance=none[0], log_posterior=none[0] + 1.0
-        )
+        new = replace(weighed(jnp.asarray(places[-1]), none[0] + 1.0, none[0], none[0]), information=eye[0])
         done = _with_round(done, new, jnp.asarray(centres[-1]), jnp.asarray(roots[-1]))
-    scales = np.resize(SCALES, per_round)
     at = np.concatenate(places).astype(np.float64)
     density = np.zeros(len(at))
-    for centre, root in zip(centres, roots, strict=True):
-        for c, scale in zip(centre.astype(np.float64), scales, strict=True):
-            density += multivariate_normal(c, scale**2 * root.astype(np.float64) @ root.T).pdf(at)
+    for c, root in zip(np.concatenate(centres), np.concatenate(roots).astype(np.float64), strict=True):
+        density += multivariate_normal(c.astype(np.float64), root @ root.T).pdf(at)
     weights = np.asarray(_log_weights(done))
     found, expected = weights[:drawn].reshape(-1), 1.0 - np.log(density)
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=2e-3)
