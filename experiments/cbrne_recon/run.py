@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from swarmsim.radiation import net_rate
-from swarmsim.results.summary import batch_row
+from swarmsim.results.batch import batch_row
 from swarmsim.runtime.progress import RichProgress
 from swarmsim.site import crossed
 

@@ -171,7 +171,7 @@ def _ridge(information: jax.Array, places: jax.Array, pivot: jax.Array | None) -
 
 
 def _is_ring(about: jax.Array, place: jax.Array, pivot: jax.Array) -> jax.Array:
-    """Whether [] places of covariance ``about`` [3, 3] reach far around ``pivot`` [3]; ``place`` [3] is a likely one."""
+    """Whether [] places of covariance ``about`` [3, 3] reach far around ``pivot`` [3]; ``place`` [3] is likely."""
     return jnp.trace(about[:2, :2]) > RING**2 * jnp.sum(jnp.square(place[:2] - pivot[:2]))
 
 

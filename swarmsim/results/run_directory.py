@@ -21,9 +21,10 @@ from swarmsim.config.scenario import Scenario
 from swarmsim.playback import figures
 from swarmsim.playback.recording import write_recording
 from swarmsim.results import names
+from swarmsim.results.batch import batch_row, batch_summary
 from swarmsim.results.out_folder import check_out, keep_elsewhere, told_of
 from swarmsim.results.record import MissionRecord, RadiationMap
-from swarmsim.results.summary import Timings, batch_row, batch_summary, summary
+from swarmsim.results.summary import Timings, summary
 from swarmsim.results.tables import measurements_table, missions_table, spectrum_table, trajectories_table
 from swarmsim.site.model import SiteModel
 

@@ -1,6 +1,5 @@
-"""What a mission found and how far it was from the truth, in plain numbers: one mission's summary, and a batch's."""
+"""What a mission found and how far it was from the truth, in plain numbers (`swarmsim.results.batch` has many)."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmsim.families.draw import columns
 from swarmsim.results.record import (
     Estimate,
     Event,
@@ -20,7 +18,7 @@ from swarmsim.results.record import (
     VehicleRecord,
 )
 from swarmsim.versions import package_versions
-from swarmsim.world.events import FAILSAFES, KINDS, LOSSES
+from swarmsim.world.events import FAILSAFES, LOSSES
 
 SURE_SIGMA = 2.0  # the greatest dose rate is that of the reading that is greatest less so many standard deviations
 _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "rerun-sdk")
@@ -43,7 +41,6 @@ _ESTIMATE_KEYS = (
     "kerma_rate_1m_ugy_h",
     "kerma_rate_1m_std_ugy_h",
 )
-_NOT_SUMMED_UP = ("true_", "source_covariance_", "survey_estimate_covariance_")
 """Beginnings of the columns of a batch's missions that have no median worth telling."""
 INTACT = "intact"
 STATES = {
@@ -77,7 +74,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
     those of the start. ``departures`` is what was drawn for the mission within its knowledge (`departures_summary`).
     """
     record = record.finite()
-    hotspot = _hotspot(record.map)
+    hotspot = hotspot_of(record.map)
     spectrum = record.spectrum
     return {
         "name": record.name,
@@ -90,8 +87,8 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "success": succeeded(record),
         "phases": {phase.name: phase_summary(record, phase) for phase in record.phases},
         "hotspot": {
-            "position_m": None if hotspot is None else _plain(hotspot),
-            "error_m": None if hotspot is None else _nearest(hotspot, record.sources)[1],
+            "position_m": None if hotspot is None else plain(hotspot),
+            "error_m": None if hotspot is None else nearest_of(hotspot, record.sources)[1],
         },
         "survey_estimate": estimate_summary(record.survey_estimate, record),
         "source": estimate_summary(record.estimate, record),
@@ -103,7 +100,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "dose_rate": dose_summary(record),
         "drawn": dict(record.drawn),
         "true_sources": [
-            {"nuclide": s.nuclide, "position_m": _plain(s.position_m), "activity_mbq": float(s.activity_mbq)}
+            {"nuclide": s.nuclide, "position_m": plain(s.position_m), "activity_mbq": float(s.activity_mbq)}
             | _form(record, s)
             | _true_dose(record, s)
             for s in record.sources
@@ -140,7 +137,7 @@ def departures_summary(record: MissionRecord) -> dict[str, dict[str, Any]] | Non
     return {
         "thickness_factor": dict(made.thickness_factor),
         "sensitivity_factor": dict(made.sensitivity_factor),
-        "pose_error_m": {name: _plain(error) for name, error in made.pose_error_m.items()},
+        "pose_error_m": {name: plain(error) for name, error in made.pose_error_m.items()},
     }
 
 
@@ -151,7 +148,7 @@ def _form(record: MissionRecord, source: TrueSource) -> dict[str, Any]:
     if source.carrier is None:
         return {}
     carrier, last = record.vehicles[source.carrier], record.track_of(source)[-1]
-    return {"form": source.form, "on": carrier.name, "end_position_m": _plain(last)}
+    return {"form": source.form, "on": carrier.name, "end_position_m": plain(last)}
 
 
 def event_summary(event: Event) -> dict[str, Any]:
@@ -173,10 +170,10 @@ def phase_summary(record: MissionRecord, phase: Phase) -> dict[str, Any]:
         "policy": phase.policy,
         "vehicles": [record.vehicles[number].name for number in phase.vehicles],
         "start_s": float(phase.start_s),
-    } | _measured(record, phase)
+    } | measured(record, phase)
 
 
-def _measured(record: MissionRecord, phase: Phase) -> dict[str, Any]:
+def measured(record: MissionRecord, phase: Phase) -> dict[str, Any]:
     """The numbers of a phase that missions of a batch may differ in."""
     rates = record.samples.of_phase(phase.name).count_rate_cps
     return {
@@ -196,7 +193,7 @@ def _length(vehicle: VehicleRecord, phase: Phase) -> float:
     return float(np.linalg.norm(np.diff(track, axis=0), axis=1).sum())
 
 
-def _hotspot(made: RadiationMap | None) -> NDArray[np.floating] | None:
+def hotspot_of(made: RadiationMap | None) -> NDArray[np.floating] | None:
     """The strongest hotspot [2] of a map."""
     return None if made is None or not len(made.hotspots_m) else np.asarray(made.hotspots_m[0], float)
 
@@ -216,15 +213,15 @@ def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[s
         return dict.fromkeys(_ESTIMATE_KEYS)
     sources, at_1_m = record.sources, record.at_1_m.get(estimate.nuclide)
     position = np.asarray(estimate.position_m, float)
-    nearest, error = _nearest(position, sources)
+    nearest, error = nearest_of(position, sources)
     activity = float(estimate.activity_mbq)
     values = (
         estimate.nuclide,
-        _plain(position),
-        _plain(np.sqrt(np.maximum(np.diag(estimate.covariance_m2), 0.0))),
+        plain(position),
+        plain(np.sqrt(np.maximum(np.diag(estimate.covariance_m2), 0.0))),
         np.asarray(estimate.covariance_m2, float).tolist(),
         error,
-        _nearest(position[:2], sources)[1],
+        nearest_of(position[:2], sources)[1],
         None if nearest is None else nearest.nuclide,
         activity,
         float(estimate.activity_std_mbq),
@@ -273,11 +270,11 @@ def dose_summary(record: MissionRecord) -> dict[str, Any] | None:
         "greatest_kerma_ugy_h": float(kerma[best]),
         "vehicle": record.vehicles[int(samples.vehicle[best])].name,
         "time_s": float(samples.time_s[best]),
-        "position_m": _plain(samples.position_m[best]),
+        "position_m": plain(samples.position_m[best]),
     }
 
 
-def _nearest(
+def nearest_of(
     position_m: NDArray[np.floating], sources: tuple[TrueSource, ...]
 ) -> tuple[TrueSource | None, float | None]:
     """The true source nearest to ``position_m`` [2 or 3] and its distance; None where the mission has no source."""
@@ -299,7 +296,8 @@ def named(spectrum: Spectrum | None) -> str | None:
     return None if spectrum is None or spectrum.nuclide in ("none", "unknown") else spectrum.nuclide
 
 
-def _plain(values: NDArray[np.floating]) -> list[float]:
+def plain(values: NDArray[np.floating]) -> list[float]:
+    """The values of a vector as a table or JSON has them."""
     return [float(v) for v in values]
 
 
@@ -317,54 +315,6 @@ def timing_summary(timings: Timings) -> dict[str, float]:
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that a result depends on."""
     return package_versions(_PACKAGES)
-
-
-def batch_row(record: MissionRecord) -> dict[str, Any]:
-    """One mission as a flat row of ``missions.parquet``, units in the names: what `batch_summary` sums up.
-
-    A phase that did not begin has no columns.
-    """
-    record = record.finite()
-    row: dict[str, Any] = {"seed": int(record.seed), "status": record.status, "finding": record.finding}
-    row["covered"] = record.covered
-    row |= columns(record.drawn)
-    for phase in record.phases:
-        row |= {f"{phase.name}_{key}": value for key, value in _measured(record, phase).items()}
-    row["duration_s"] = float(record.end_s)
-    hotspot = _hotspot(record.map)
-    row |= _axes("hotspot", None if hotspot is None else _plain(hotspot), ("east_m", "north_m"))
-    row["hotspot_error_m"] = None if hotspot is None else _nearest(hotspot, record.sources)[1]
-    for name, estimate in (("survey_estimate", record.survey_estimate), ("source", record.estimate)):
-        values = estimate_summary(estimate, record)
-        row |= _axes(name, values.pop("position_m"), ("east_m", "north_m", "up_m"))
-        row |= _axes(name, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
-        row |= _covariances(name, values.pop("position_covariance_m2"))
-        row |= {f"{name}_{key}": value for key, value in values.items()}
-    if record.departures is not None:
-        row |= {f"true_thickness_factor_{key}": value for key, value in record.departures.thickness_factor.items()}
-        row |= {f"true_sensitivity_factor_{key}": value for key, value in record.departures.sensitivity_factor.items()}
-    row["sources_found"] = len(record.estimates)
-    row["nuclide"] = named(record.spectrum)
-    row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
-    dose = dose_summary(record)
-    row["dose_rate_greatest_usv_h"] = None if dose is None else dose["greatest_usv_h"]
-    row["crashed"] = sum(bool(v.crashed) for v in record.vehicles)
-    saved = {e.vehicle for e in record.events if e.kind in FAILSAFES}
-    row["failsafes"] = sum(v.name in saved for v in record.vehicles)
-    row["incidents"] = ", ".join(f"{e.vehicle}: {e.kind}" for e in record.events if e.kind in KINDS)
-    row["energy_wh"] = sum(energy_wh(v) for v in record.vehicles)
-    row["success"] = succeeded(record)
-    return row
-
-
-def _axes(name: str, values: list[float] | None, axes: tuple[str, ...]) -> dict[str, float | None]:
-    return {f"{name}_{axis}": None if values is None else values[k] for k, axis in enumerate(axes)}
-
-
-def _covariances(name: str, matrix: list[list[float]] | None) -> dict[str, float | None]:
-    """The covariances [m2] of a place between axes; its variances follow from the standard deviations."""
-    pairs = {"east_north": (0, 1), "east_up": (0, 2), "north_up": (1, 2)}
-    return {f"{name}_covariance_{axes}_m2": None if matrix is None else matrix[i][j] for axes, (i, j) in pairs.items()}
 
 
 def succeeded(record: MissionRecord) -> bool:
@@ -387,41 +337,5 @@ def succeeded(record: MissionRecord) -> bool:
         return False
     if record.sought == "source":
         return True
-    nearest, _ = _nearest(np.asarray(record.estimate.position_m, float), active)
+    nearest, _ = nearest_of(np.asarray(record.estimate.position_m, float), active)
     return nearest is not None and named(record.spectrum) == nearest.nuclide
-
-
-def all_keys(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Columns of all rows, in the order of the first row that has most of them."""
-    longest = max(rows, key=len)
-    return list(dict.fromkeys(key for row in (longest, *rows) for key in row))
-
-
-def batch_summary(rows: Sequence[dict[str, Any]], records: Sequence[MissionRecord], timings: Timings) -> dict[str, Any]:
-    """A batch in numbers: median, least and greatest of each numeric column of ``rows``, over the missions with one.
-
-    ``found`` says in how many missions the column has a value at all.
-    """
-    numbers = {}
-    for key in all_keys(rows):
-        found = (row.get(key) for row in rows)
-        values = [value for value in found if isinstance(value, int | float) and not isinstance(value, bool)]
-        if key != "seed" and values and not key.startswith(_NOT_SUMMED_UP):
-            spread = (("median", np.median), ("min", np.min), ("max", np.max))
-            numbers[key] = {name: float(of(values)) for name, of in spread} | {"found": len(values)}
-    seeds = [row["seed"] for row in rows]
-    return {
-        "name": records[0].name,
-        "site": records[0].site,
-        "missions": len(rows),
-        "seed_first": min(seeds),
-        "seed_last": max(seeds),
-        "success_rate": float(np.mean([row["success"] for row in rows])),
-        "statuses": dict(Counter(row["status"] for row in rows)),
-        "crashed_vehicles": int(sum(row["crashed"] for row in rows)),
-        "failsafe_vehicles": int(sum(row["failsafes"] for row in rows)),
-        "metrics": numbers,
-        "real_time_factor": real_time_factor(records, timings),
-        "timing": timing_summary(timings),
-        "versions": versions(),
-    }

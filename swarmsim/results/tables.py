@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from swarmsim.results.batch import all_keys
 from swarmsim.results.record import MissionRecord, Spectrum, Window
-from swarmsim.results.summary import all_keys
 
 AXES = ("east", "north", "up")
 DOSES = ("live_s", "dose_rate_usv_h", "dose_rate_std_usv_h", "kerma_rate_ugy_h")

@@ -41,7 +41,7 @@ def test_the_median_decides_whether_a_bar_is_met(experiment):
 
 
 def test_figures_name_columns_that_missions_have(experiment):
-    from swarmsim.results.summary import batch_row
+    from swarmsim.results.batch import batch_row
     from tests.synthetic import mission
 
     row = batch_row(mission())

@@ -14,10 +14,11 @@ import pytest
 
 from swarmsim.config.errors import InputError
 from swarmsim.results import run_directory
+from swarmsim.results.batch import batch_row
 from swarmsim.results.out_folder import EXPORT, READ_LOG, RUN, check_folder, check_out
 from swarmsim.results.record import MissionRecord
 from swarmsim.results.run_directory import Built, write_run
-from swarmsim.results.summary import Timings, batch_row
+from swarmsim.results.summary import Timings
 from swarmsim.site.model import SiteModel
 from tests import synthetic
 

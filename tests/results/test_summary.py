@@ -6,8 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from swarmsim.results.batch import batch_row, batch_summary
 from swarmsim.results.record import Departures, Event, MissionRecord, Phase, Samples, TrueSource, VehicleRecord
-from swarmsim.results.summary import STATES, Timings, batch_row, batch_summary, real_time_factor, succeeded, summary
+from swarmsim.results.summary import STATES, Timings, real_time_factor, succeeded, summary
 from swarmsim.world.events import KINDS
 from tests import synthetic
 
