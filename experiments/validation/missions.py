@@ -3,6 +3,7 @@
     python -m experiments.validation.missions random_recon --missions 256 --out out/works_yard
     python -m experiments.validation.missions random_recon --set site=meadows --missions 64 --out out/meadows
     python -m experiments.validation.missions random_recon --without-sources --missions 256 --out out/none
+    python -m experiments.validation.missions experiments/validation/near_starts.yaml --survey --out out/starts
 
 Writes ``sources.csv`` (a row for each true source and each false one), ``summary.json`` and ``errors.png``. A true
 source counts as found by the estimate next to it, up to 25 m away. It is detectable where the same likelihood, with all
@@ -46,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE")
     parser.add_argument("--without-sources", action="store_true", help="fly the mission without any source")
+    parser.add_argument("--survey", action="store_true", help="judge what the survey found, not all counts together")
     options = parser.parse_args(arguments)
     settings = options.set + (without_sources(options.mission, options.set) if options.without_sources else [])
     simulation = swarmsim.build(swarmsim.load(options.mission, settings))
@@ -53,6 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     batch = simulation.rollout(seeds)
     detectable = detectable_ratios(simulation, batch)
     records = [swarmsim.mission_record(simulation, batch, i) for i in range(options.missions)]
+    if options.survey:
+        records = [by_survey(record) for record in records]
     mission = simulation.scenario.mission
     assert mission.localisation is not None
     asked = (mission.localisation.detection_sigma**2, mission.localisation.further_sigma**2)
@@ -66,6 +70,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     (options.out / "summary.json").write_text(json.dumps(summary, indent=1))
     _figure(rows, options.out / "errors.png")
     print(json.dumps(summary))
+
+
+def by_survey(record: MissionRecord) -> MissionRecord:
+    """The record with the survey's sources in the place of those by all counts; its status stays."""
+    return replace(record, estimate=record.survey_estimate, further=record.survey_further)
 
 
 def without_sources(mission: str, settings: list[str]) -> list[str]:

@@ -1,5 +1,6 @@
 """Validation of missions: which estimate stands for which source, and what is counted of them."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 import swarmsim
 from experiments.validation import pairs
-from experiments.validation.missions import matches, rows_of, summarised, without_sources
+from experiments.validation.missions import by_survey, matches, rows_of, summarised, without_sources
 
 ASKED = (30.0, 60.0)
 
@@ -123,6 +124,23 @@ def test_false_sources_have_a_row_of_their_own():
     rows = rows_of(record([source(0.0)], [estimate(0.2), estimate(60.0, nuclide="Cs-137")]), np.array([80.0]), ASKED)
     assert [row["true"] for row in rows] == ["Co-60", None]
     assert (rows[1]["found"], rows[1]["sigmas"]) == ("Cs-137", None)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What of a record says what was found."""
+
+    status: str
+    estimate: object
+    further: tuple
+    survey_estimate: object
+    survey_further: tuple
+
+
+def test_what_the_survey_found_can_be_judged_by_itself():
+    by_all, before, beside = estimate(0.1), estimate(3.0), estimate(60.0)
+    judged = by_survey(Found("located", by_all, (), before, (beside,)))
+    assert (judged.status, judged.estimate, judged.further) == ("located", before, (beside,))
 
 
 def test_shares_are_of_those_that_they_speak_of():
