@@ -76,7 +76,10 @@ def run_scenario(
         run(scenario, folder, missions, progress, force=force)
     console = Console()
     summary = read_summary(folder)
-    console.print(summary_table(summary, scenario.mission.name, missions))
+    if missions > 1:
+        console.print(*batch_tables(summary, scenario.mission.name))
+    else:
+        console.print(summary_table(summary, scenario.mission.name))
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
     if (folder / RECORDING).is_file():
         console.print(f"Watch:   swarmsim view {folder}", highlight=False, soft_wrap=True)
@@ -149,15 +152,23 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return summary
 
 
-def summary_table(summary: dict[str, Any], name: str, missions: int = 1) -> Table:
-    """What a summary holds, as a table: the known rows of one mission, or every number of a batch."""
-    title = name if missions == 1 else f"{name}, {missions} missions"
-    table = Table("what", "value", "unit", title=title, title_justify="left")
+def batch_tables(summary: dict[str, Any], name: str) -> tuple[Table, Table]:
+    """What a batch came to, and its numbers: a row for each, over the missions that have it."""
+    facts = Table("what", "value", title=f"{name}, {summary['missions']} missions", title_justify="left")
+    numbers = Table("number", "median", "least", "greatest", "missions")
+    for column in (facts.columns[1], *numbers.columns[1:]):
+        column.justify = "right"
+    for path, number in _leaves({key: summary[key] for key in summary if key not in ("metrics", "versions")}, ""):
+        facts.add_row(escape(path), value_text(number))
+    for key, row in summary["metrics"].items():
+        numbers.add_row(escape(key), *(value_text(row[of]) for of in ("median", "min", "max", "found")))
+    return facts, numbers
+
+
+def summary_table(summary: dict[str, Any], name: str) -> Table:
+    """The known rows of one mission's summary."""
+    table = Table("what", "value", "unit", title=name, title_justify="left")
     table.columns[1].justify = "right"
-    if missions > 1:
-        for path, number in _leaves(summary, ""):
-            table.add_row(path, value_text(number), "")
-        return table
     table.add_row("Status", summary["status"].replace("_", " "))
     table.add_row("Finding", summary["finding"])
     for warning in summary["warnings"]:
