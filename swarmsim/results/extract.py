@@ -28,7 +28,7 @@ from swarmsim.results.record import (
 )
 from swarmsim.results.samples import READ, measured_rows, samples_of, windows_of
 from swarmsim.results.sources import true_sources
-from swarmsim.results.status import Fit, Verdict, assess
+from swarmsim.results.status import Fit, Verdict, assess, survey_doubts
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.site.model import height_at
@@ -91,7 +91,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         finding=finding(verdict, final, spectrum, _hindrance(simulation, end, events), _one_nuclide(simulation)),
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
-        warnings=(CROWDED,) if bool(end.world.crowded) else (),
+        warnings=(*((CROWDED,) if bool(end.world.crowded) else ()), *survey_doubts(surveyed, final)),
         drawn=batch.draws.told(index),
         windows_kev=windows_of(simulation),
         at_1_m=gamma_constants(simulation, (*surveyed, *final, *sources)),

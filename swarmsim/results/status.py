@@ -247,6 +247,30 @@ def _unexplained(chart: RadiationMap, final: Sequence[Estimate], background_std:
     return [("ambiguous", f"hotspots far from what was found suggest further sources, at {text} m")]
 
 
+def survey_doubts(survey: Sequence[Estimate], sources: Sequence[Estimate]) -> tuple[str, ...]:
+    """Sentences on what the survey stated too well: by too little to contradict the answer of all counts.
+
+    Sources beside one another are left out: the survey tells them apart no better than it can.
+    """
+    told = []
+    for before in survey:
+        alike = [one for one in sources if one.nuclide == before.nuclide]
+        if not alike or _disagreement(before, survey, sources):
+            continue
+        final = min(alike, key=lambda one: _apart_m(one, before))
+        if len(_beside(before, survey)) > 1 or len(_beside(final, sources)) > 1:
+            continue
+        (begun, of_first), (ended, of_last) = _centre([before]), _centre([final])
+        off = ended - begun
+        sigmas = float(np.sqrt(off @ np.linalg.solve(of_first + of_last, off)))
+        if sigmas > APART_SIGMA:
+            told.append(
+                f"the survey by itself had the {before.nuclide} source {np.linalg.norm(off):.1f} m from where all "
+                f"counts have it, {sigmas:.0f} standard deviations as stated: its place was stated too well"
+            )
+    return tuple(told)
+
+
 def _disagreement(
     before: Estimate, survey: Sequence[Estimate], sources: Sequence[Estimate]
 ) -> list[tuple[Status, str]]:

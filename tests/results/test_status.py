@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
-from swarmsim.results.status import CERTAIN, Fit, assess, coverage
+from swarmsim.results.status import CERTAIN, Fit, assess, coverage, survey_doubts
 
 GOOD = Fit(misfit=0.3, chi_squared=1.01)
 SIDE_M, HEIGHT_M = 60.0, 20.0
@@ -177,6 +177,20 @@ def test_a_weak_source_far_from_others_of_its_nuclide_is_believed() -> None:
 def test_a_counter_is_saturated_short_of_its_highest_rate() -> None:
     assert verdict(samples=survey(rate=0.7 * 184e3)).status == "located"
     assert verdict(samples=survey(rate=0.8 * 184e3)).status == "saturated"
+
+
+def test_a_survey_that_stated_a_place_too_well_is_told() -> None:
+    final = (estimate(0.0, std=0.05), estimate(60.0, nuclide="Cs-137"))
+    (told,) = survey_doubts((estimate(1.8, std=0.3), estimate(61.0, std=0.5, nuclide="Cs-137")), final)
+    assert told == (
+        "the survey by itself had the Co-60 source 1.8 m from where all counts have it, "
+        "6 standard deviations as stated: its place was stated too well"
+    )
+    assert survey_doubts((estimate(1.4, std=0.3),), final) == ()
+    assert survey_doubts((estimate(12.0, std=1.0),), final) == ()  # the answer is `inconsistent` by that
+    assert survey_doubts((estimate(1.8, std=0.3, nuclide="F-18"),), final) == ()
+    assert survey_doubts((estimate(1.8, std=0.3), estimate(5.0)), final) == ()  # beside one another
+    assert survey_doubts((), final) == ()
 
 
 def test_a_source_that_the_survey_did_not_show_is_compared_with_none() -> None:
