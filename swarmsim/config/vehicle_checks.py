@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from swarmsim.config.vehicles import Multirotor, SkidSteer
 
 GRAVITY_M_S2 = 9.81
+"""Acceleration of gravity, along -z of the world; the value of the models that the vehicle files quote."""
 CELL_FULL_V = 4.1  # without load (`swarmsim.vehicles.battery`)
 SINGULAR = 1e-4  # of the largest: a smaller singular value of what rotors do is none
 REACH_SHARE = 0.98  # of its rotors' reach a vehicle's cylinder has at least: files round both

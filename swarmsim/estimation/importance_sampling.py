@@ -97,41 +97,11 @@ def sample_posterior(
     normal = jax.scipy.special.ndtri(jnp.clip(even, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
     local = index % len(SCALES) >= ABOUT_MEAN
 
-    # The places of rounds to come have no weight yet, and their distributions no density.
-    none, eye = jnp.zeros((rounds, per_round)), jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
-    empty = Weighed(
-        place=jnp.zeros((rounds, per_round, 3)),
-        log_activity=none,
-        variance=none,
-        log_posterior=jnp.full((rounds, per_round), -jnp.inf),
-        information=eye,
-    )
-    nowhere = _Rounds(
-        known=empty,
-        centres=jnp.zeros((rounds, per_round, 3)),
-        inverse=eye,
-        mixture=jnp.full((rounds, per_round), -jnp.inf),
-        count=jnp.int32(0),
-    )
-
     def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
         """Centres [P, 3] and covariances [P, 3, 3] of the next round."""
-        known, first = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), done.known), ~_any_weight(done)
-        weight = flattened(_log_weights(done), PLACED_EFFECTIVE)
+        first, weight = ~_any_weight(done), flattened(_log_weights(done), PLACED_EFFECTIVE)
         mean, about = _moments(done.known.place, weight)
-        likely = drawn_evenly(weight.reshape(-1), per_round)
-        # where walls cut it short a ridge is narrower than its curvature promises
-        narrower = scaled_inverse(about + _least(about))
-        if pivot is not None:
-            best, begun = jnp.argmax(known.log_posterior), done.count == TURNED
-            turn = begun | ((done.count % 2 == TURNED % 2) & _is_ring(about, known.place[best], pivot))
-            likely = jnp.where(begun, best, likely)
-            narrower = jnp.where(turn, 0.0, narrower)
-        places = known.place[likely]
-        ridges = _ridge(known.information[likely] + narrower, places, pivot)
-        if pivot is not None:
-            share = (jnp.cumsum(local) - 1 + jnp.mod(done.count * _EVEN[0], 1.0)) / jnp.maximum(jnp.sum(local), 1)
-            places, ridges = _turned(places, ridges, pivot, jnp.where(turn, 2.0 * jnp.pi * share, 0.0))
+        places, ridges = _along_ridges(done, weight, about, local, pivot)
         centres = jnp.where(first, starts, jnp.where(local[:, None], places, mean))
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
         scales = jnp.where(first, jnp.array(FIRST_SCALES), jnp.array(SCALES))[index % len(SCALES)]
@@ -147,7 +117,7 @@ def sample_posterior(
         enough = _worth(done) >= ENOUGH_EFFECTIVE
         return (done.count < rounds) & ~(enough & (done.count >= LEAST_ROUNDS))
 
-    done = repeat_while(more, round_, nowhere)
+    done = repeat_while(more, round_, _nowhere(rounds, per_round))
     return _summary(done)
 
 
@@ -155,6 +125,49 @@ def _least(covariance: jax.Array) -> jax.Array:
     """What makes covariances [..., 3, 3] positive, and none of their standard deviations too small."""
     least = LEAST_STD_M**2 + LEAST_SHARE**2 * jnp.trace(covariance, axis1=-2, axis2=-1)
     return least[..., None, None] * jnp.eye(3)
+
+
+def _nowhere(rounds: int, per_round: int) -> _Rounds:
+    """No round yet: the places of those to come have no weight, and their distributions no density."""
+    none, eye = jnp.zeros((rounds, per_round)), jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
+    empty = Weighed(
+        place=jnp.zeros((rounds, per_round, 3)),
+        log_activity=none,
+        variance=none,
+        log_posterior=jnp.full((rounds, per_round), -jnp.inf),
+        information=eye,
+    )
+    return _Rounds(
+        known=empty,
+        centres=empty.place,
+        inverse=eye,
+        mixture=empty.log_posterior,
+        count=jnp.int32(0),
+    )
+
+
+def _along_ridges(
+    done: _Rounds, weight: jax.Array, about: jax.Array, local: jax.Array, pivot: jax.Array | None
+) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    """Likely places [P, 3] and covariances [P, 3, 3] of their ridges, to draw about; turned around a ring.
+
+    ``weight`` [Q, P] and ``about`` [3, 3] are the weights of the places so far and their covariance, ``local`` [P] says
+    which places of the next round are to lie about these.
+    """
+    known = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), done.known)
+    likely = drawn_evenly(weight.reshape(-1), len(local))
+    # where walls cut it short a ridge is narrower than its curvature promises
+    narrower = scaled_inverse(about + _least(about))
+    if pivot is None:
+        places = known.place[likely]
+        return places, _ridge(known.information[likely] + narrower, places, pivot)
+    best, begun = jnp.argmax(known.log_posterior), done.count == TURNED
+    turn = begun | ((done.count % 2 == TURNED % 2) & _is_ring(about, known.place[best], pivot))
+    likely = jnp.where(begun, best, likely)
+    places = known.place[likely]
+    ridges = _ridge(known.information[likely] + jnp.where(turn, 0.0, narrower), places, pivot)
+    share = (jnp.cumsum(local) - 1 + jnp.mod(done.count * _EVEN[0], 1.0)) / jnp.maximum(jnp.sum(local), 1)
+    return _turned(places, ridges, pivot, jnp.where(turn, 2.0 * jnp.pi * share, 0.0))
 
 
 def _ridge(information: jax.Array, places: jax.Array, pivot: jax.Array | None) -> jax.Array:

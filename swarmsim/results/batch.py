@@ -26,6 +26,7 @@ from swarmsim.results.summary import (
 from swarmsim.world.events import FAILSAFES, KINDS
 
 _NOT_SUMMED_UP = ("true_", "source_covariance_", "survey_estimate_covariance_")
+"""Beginnings of the columns of a batch's missions that have no median worth telling."""
 
 
 def batch_row(record: MissionRecord) -> dict[str, Any]:

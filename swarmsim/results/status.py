@@ -254,19 +254,16 @@ def survey_doubts(survey: Sequence[Estimate], sources: Sequence[Estimate]) -> tu
     """
     told = []
     for before in survey:
-        alike = [one for one in sources if one.nuclide == before.nuclide]
-        if not alike or _disagreement(before, survey, sources):
+        final = _of_all_counts(before, sources)
+        if final is None or _disagreement(before, survey, sources):
             continue
-        final = min(alike, key=lambda one: _apart_m(one, before))
         if len(_beside(before, survey)) > 1 or len(_beside(final, sources)) > 1:
             continue
-        (begun, of_first), (ended, of_last) = _centre([before]), _centre([final])
-        off = ended - begun
-        sigmas = float(np.sqrt(off @ np.linalg.solve(of_first + of_last, off)))
+        distance, sigmas = _off([before], [final], 0.0)
         if sigmas > APART_SIGMA:
             told.append(
-                f"the survey by itself had the {before.nuclide} source {np.linalg.norm(off):.1f} m from where all "
-                f"counts have it, {sigmas:.0f} standard deviations as stated: its place was stated too well"
+                f"the survey by itself had the {before.nuclide} source {distance:.1f} m from where all counts have it, "
+                f"{sigmas:.0f} standard deviations as stated: its place was stated too well"
             )
     return tuple(told)
 
@@ -279,10 +276,9 @@ def _disagreement(
     Each by itself or with those beside it: the survey tells sources beside one another apart no better than it can, and
     of two at the limit of what is beside one another either may have them apart.
     """
-    alike = [one for one in sources if one.nuclide == before.nuclide]
-    if not alike:
+    final = _of_all_counts(before, sources)
+    if final is None:
         return []
-    final = min(alike, key=lambda one: _apart_m(one, before))
     first, last = _beside(before, survey), _beside(final, sources)
     said = [_contradiction(a, b) for a, b in itertools.product(([before], first), ([final], last))]
     return [("inconsistent", said[-1])] if said[-1] and all(said) else []
@@ -290,10 +286,8 @@ def _disagreement(
 
 def _contradiction(first: Sequence[Estimate], last: Sequence[Estimate]) -> str:
     """What sources by the survey and by all counts do not agree in; nothing if they do."""
-    (begun, of_first), (ended, of_last) = _centre(first), _centre(last)
-    apart, covariance = ended - begun, of_first + of_last + MODEL_STD_M**2 * np.eye(2)
-    if float(apart @ np.linalg.solve(covariance, apart)) > APART_SIGMA**2:
-        distance = float(np.linalg.norm(apart))
+    distance, sigmas = _off(first, last, MODEL_STD_M)
+    if sigmas > APART_SIGMA:
         return f"the {last[0].nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
     totals = [sum(max(one.activity_mbq, 1e-9) for one in group) for group in (first, last)]
     stds = [max(one.activity_std_mbq for one in group) for group in (first, last)]
@@ -302,6 +296,19 @@ def _contradiction(first: Sequence[Estimate], last: Sequence[Estimate]) -> str:
         text = f"the activity of the {last[0].nuclide} source by the survey and by all counts differs "
         return f"{text}{np.exp(abs(ratio)):.3g} times"
     return ""
+
+
+def _of_all_counts(before: Estimate, sources: Sequence[Estimate]) -> Estimate | None:
+    """The nearest of the ``sources`` by all counts that is of the nuclide of one of the survey; None without any."""
+    alike = [one for one in sources if one.nuclide == before.nuclide]
+    return min(alike, key=lambda one: _apart_m(one, before), default=None)
+
+
+def _off(first: Sequence[Estimate], last: Sequence[Estimate], model_std_m: float) -> tuple[float, float]:
+    """Distance (m) between the centres of two groups, and in standard deviations, with ``model_std_m`` more."""
+    (begun, of_first), (ended, of_last) = _centre(first), _centre(last)
+    apart, covariance = ended - begun, of_first + of_last + model_std_m**2 * np.eye(2)
+    return float(np.linalg.norm(apart)), float(np.sqrt(apart @ np.linalg.solve(covariance, apart)))
 
 
 def _apart_m(one: Estimate, other: Estimate) -> float:

@@ -41,7 +41,6 @@ _ESTIMATE_KEYS = (
     "kerma_rate_1m_ugy_h",
     "kerma_rate_1m_std_ugy_h",
 )
-"""Beginnings of the columns of a batch's missions that have no median worth telling."""
 INTACT = "intact"
 STATES = {
     "crash": "crashed",

@@ -6,10 +6,8 @@ those of the vehicle's centre of mass. One vehicle each: the missions layer adds
 
 import jax
 
+from swarmsim.config.vehicle_checks import GRAVITY_M_S2 as GRAVITY_M_S2
 from swarmsim.pytree import pytree
-
-GRAVITY_M_S2 = 9.81
-"""Acceleration of gravity, along -z of the world; the value of the models that the vehicle files quote."""
 
 
 @pytree

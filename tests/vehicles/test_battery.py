@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarmsim.config.vehicle_checks import CELL_FULL_V
 from swarmsim.vehicles.battery import open_circuit_voltage, under_load
 from swarmsim.vehicles.multirotor import rotor_speeds
 from tests.flights import params_of
@@ -20,6 +21,10 @@ def test_a_cell_has_the_voltages_of_chen_and_rincon_mora():
     np.testing.assert_allclose(cells, [2.654, 3.6738, 3.8034, 4.103], atol=2e-3)
     charge = jnp.linspace(0.0, 1.0, 101)
     assert (np.diff(np.asarray(jax.vmap(lambda s: open_circuit_voltage(PACK, s))(charge))) > 0).all()
+
+
+def test_checks_of_vehicles_know_a_full_cell():
+    assert float(open_circuit_voltage(PACK, jnp.ones(()))) / float(PACK.cells) == pytest.approx(CELL_FULL_V, abs=0.01)
 
 
 @given(st.floats(0.0, 0.98), st.floats(0.0, 1500.0))

@@ -7,12 +7,12 @@ import numpy as np
 
 from swarmsim.autopilot.frames import yaw_of_quaternion
 from swarmsim.autopilot.standin.body import Motion, Sensed
+from swarmsim.config.vehicle_checks import GRAVITY_M_S2
 
 LAG_S = 0.15
 GAIN_1_S = 1.0
 CLIMB_MAX_M_S = 3.0
 CLIMBS_M_S = 0.2
-GRAVITY_M_S2 = 9.81
 CRASH_M_S = 2.0
 DRAIN_1_S = 1e-4
 
