@@ -86,21 +86,25 @@ def climbing(tmp_path_factory):
     return swarmsim.build(swarmsim.load(written(folder, "climbing", UAVS, phases)))
 
 
-def test_a_users_policy_from_a_file_flies(climbing):
-    batch = climbing.rollout(0)
-    record = swarmsim.mission_record(climbing, batch, 0)
-    (phase,) = record.phases
-    assert phase.in_time
-    for vehicle in record.vehicles:
-        height = vehicle.position_m[-1, 2] - vehicle.position_m[0, 2]
-        assert height == pytest.approx(6.0, abs=0.4)
-    asked = np.asarray(batch.end.phases[0].memory)
-    ticks = round(float(batch.end.over_s[0]) / 0.5) * 50
-    np.testing.assert_allclose(asked, np.ceil(ticks / 10), atol=6)  # each 0.1 s; the last segment runs to its end
+@pytest.fixture(scope="module")
+def together(climbing):
+    return climbing.rollout([0, 3, 5])
 
 
-def test_decision_periods_in_one_call_are_those_of_a_call_each(climbing, monkeypatch):
-    together = climbing.rollout([0, 3, 5])
+def test_a_users_policy_from_a_file_flies(climbing, together):
+    for index in range(3):
+        record = swarmsim.mission_record(climbing, together, index)
+        (phase,) = record.phases
+        assert phase.in_time
+        for vehicle in record.vehicles:
+            height = vehicle.position_m[-1, 2] - vehicle.position_m[0, 2]
+            assert height == pytest.approx(6.0, abs=0.4)
+        asked = np.asarray(together.end.phases[0].memory)[index]
+        ticks = round(float(together.end.over_s[index]) / 0.5) * 50
+        np.testing.assert_allclose(asked, np.ceil(ticks / 10), atol=6)  # each 0.1 s; the last segment runs to its end
+
+
+def test_decision_periods_in_one_call_are_those_of_a_call_each(climbing, together, monkeypatch):
     monkeypatch.setattr("swarmsim.runtime.mission_run.AT_ONCE", 1)
     one_by_one = climbing.rollout([0, 3, 5])
     assert len(together.segments) < len(one_by_one.segments) == sum(s.periods for s in one_by_one.segments)
@@ -189,18 +193,29 @@ def test_values_that_change_more_than_values_are_refused(climbing):
         climbing.rollout([0], values={"wind.sped_m_s": [1.0]})
 
 
-def test_phases_overlap_and_follow_one_another(tmp_path):
+WEST, SOUTH, EAST, NORTH = AREA = (-180.0, 30.0, -140.0, 60.0)  # m
+
+
+@pytest.fixture(scope="module")
+def overlapping(tmp_path_factory):
+    """The record of a mission whose UAVs cover an area while a rover drives out and back."""
     vehicles = UAVS + "\n  - {name: rover, type: orpheus, position_m: [-150, 60]}"
-    phases = """
-- {name: fly, who: uav, policy: waypoints, time_limit_s: 90,
-   settings: {points: [[-160, 30]], speed_m_s: 5, altitude_m: 10}}
-- {name: drive, who: rover, policy: waypoints, start: {at_s: 4}, time_limit_s: 60,
-   settings: {points: [[-145, 66]], speed_m_s: 1.0}}
-- {name: back, who: rover, policy: waypoints, start: {after: drive, delay_s: 2}, time_limit_s: 60,
-   settings: {points: [[-150, 60]], speed_m_s: 1.0}}
+    corners = f"[[{WEST}, {SOUTH}], [{EAST}, {SOUTH}], [{EAST}, {NORTH}], [{WEST}, {NORTH}]]"
+    phases = f"""
+- {{name: fly, who: uav, policy: parallel_lines, time_limit_s: 120,
+   settings: {{altitude_m: 12, speed_m_s: 6, line_spacing_m: 6, area_m: {corners}}}}}
+- {{name: drive, who: rover, policy: waypoints, start: {{at_s: 4}}, time_limit_s: 60,
+   settings: {{points: [[-145, 66]], speed_m_s: 1.0}}}}
+- {{name: back, who: rover, policy: waypoints, start: {{after: drive, delay_s: 2}}, time_limit_s: 60,
+   settings: {{points: [[-150, 60]], speed_m_s: 1.0}}}}
 """
-    simulation = swarmsim.build(swarmsim.load(written(tmp_path, "overlap", vehicles, phases)))
-    record = swarmsim.mission_record(simulation, simulation.rollout(0), 0)
+    folder = tmp_path_factory.mktemp("overlap")
+    simulation = swarmsim.build(swarmsim.load(written(folder, "overlap", vehicles, phases)))
+    return swarmsim.mission_record(simulation, simulation.rollout(3), 0)
+
+
+def test_phases_overlap_and_follow_one_another(overlapping):
+    record = overlapping
     fly, drive, back = record.phases
     assert all(phase.in_time for phase in record.phases)
     assert fly.start_s == 0.0
@@ -213,16 +228,25 @@ def test_phases_overlap_and_follow_one_another(tmp_path):
         assert np.linalg.norm(uav.position_m[-1] - uav.position_m[0]) < 0.6  # home again
 
 
+def test_an_area_of_the_users_is_covered_and_nothing_else(overlapping):
+    assert not any(vehicle.crashed for vehicle in overlapping.vehicles)
+    flown = [vehicle.position_m for vehicle in overlapping.vehicles[:2]]
+    places = np.concatenate([place[place[:, 2] > place[:, 2].max() - 3.0] for place in flown])
+    homes = np.array([place[0, :2] for place in flown])
+    low, high = np.minimum(homes.min(axis=0), AREA[:2]), np.maximum(homes.max(axis=0), AREA[2:])
+    assert np.all((places[:, :2] > low - 4.0) & (places[:, :2] < high + 4.0))
+    across = np.stack(np.meshgrid(np.arange(WEST + 2, EAST, 4.0), np.arange(SOUTH + 2, NORTH, 4.0)), axis=-1)
+    gaps = np.linalg.norm(across[..., None, :] - places[:, :2], axis=-1).min(axis=-1)
+    assert gaps.max() < 4.0  # half the spacing, and half a metre of wind
+
+
 TEAMS = {
-    "quadrotors with hexarotors": "  - {name: a, type: tarot_t650, position_m: [-190, 40]}\n"
-    "  - {name: b, type: dji_f550, position_m: [-180, 40]}",
     "T650 with x500": "  - {name: a, type: tarot_t650, position_m: [-190, 40]}\n"
     "  - {name: b, type: x500, position_m: [-180, 40]}",
     "several rovers": "  - {name: a, type: orpheus, position_m: [-190, 40]}\n"
     "  - {name: b, type: orpheus, position_m: [-180, 40]}",
     "UAVs and rovers": "  - {name: a, type: x500, position_m: [-190, 40]}\n"
     "  - {name: b, type: orpheus, position_m: [-180, 40]}\n  - {name: c, type: dji_f550, position_m: [-170, 40]}",
-    "one UAV": "  - {name: a, type: x500, position_m: [-190, 40]}",
 }
 
 
@@ -255,25 +279,6 @@ class Move:
             return memory, swarmsim.fly_velocity(jnp.array([0.0, 0.0, 1.0]))
         return memory, swarmsim.DriveCommand(speed_m_s=jnp.float32(1.0), yaw_rate_rad_s=jnp.zeros(()))
 '''
-
-
-def test_an_area_of_the_users_is_covered_and_nothing_else(tmp_path):
-    west, south, east, north = -180.0, 30.0, -140.0, 60.0
-    area = f"[[{west}, {south}], [{east}, {south}], [{east}, {north}], [{west}, {north}]]"
-    settings = f"{{altitude_m: 12, speed_m_s: 6, line_spacing_m: 6, area_m: {area}}}"
-    phases = f"- {{name: cover, who: uav, policy: parallel_lines, settings: {settings}, time_limit_s: 120}}"
-    simulation = swarmsim.build(swarmsim.load(written(tmp_path, "area", UAVS, phases)))
-    record = swarmsim.mission_record(simulation, simulation.rollout(3), 0)
-    assert record.phases[0].in_time
-    assert not any(vehicle.crashed for vehicle in record.vehicles)
-    flown = [vehicle.position_m for vehicle in record.vehicles]
-    places = np.concatenate([place[place[:, 2] > place[:, 2].max() - 3.0] for place in flown])
-    homes = np.array([place[0, :2] for place in flown])
-    low, high = np.minimum(homes.min(axis=0), [west, south]), np.maximum(homes.max(axis=0), [east, north])
-    assert np.all((places[:, :2] > low - 4.0) & (places[:, :2] < high + 4.0))
-    across = np.stack(np.meshgrid(np.arange(west + 2, east, 4.0), np.arange(south + 2, north, 4.0)), axis=-1)
-    gaps = np.linalg.norm(across[..., None, :] - places[:, :2], axis=-1).min(axis=-1)
-    assert gaps.max() < 4.0  # half the spacing, and half a metre of wind
 
 
 def test_a_vehicle_without_a_detector_flies(tmp_path):
@@ -346,9 +351,9 @@ def test_a_policy_reads_the_sensors_that_it_says_it_senses(tmp_path):
         assert vehicle.position_m[-1, 2] - vehicle.position_m[0, 2] == pytest.approx(6.0, abs=2.0)
 
 
-def test_a_mission_that_reads_no_sensor_carries_none(climbing):
+def test_a_mission_that_reads_no_sensor_carries_none(climbing, together):
     assert climbing.plan.sensors is None
-    assert climbing.rollout([0]).end.sensing is None
+    assert together.end.sensing is None
 
 
 @pytest.mark.parametrize(
