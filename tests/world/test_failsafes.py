@@ -21,6 +21,8 @@ RULES = {
     "link": {"action": "return", "range_m": 90.0, "after_s": 1.0},
     "return_clearance_m": 5.0,
 }
+# compiled as a whole: piece by piece, each operation is a program of its own
+RESCUE, FAILING, RECORDED = jax.jit(rescue_of), jax.jit(failing), jax.jit(record_events, static_argnums=1)
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +166,7 @@ def test_on_its_way_to_a_clear_place_it_climbs_first_but_not_for_ever(late_s, cl
     times = np.full(len(events.KINDS), np.inf, np.float32)
     times[events.KINDS.index("wind")] = 5.0
     position = jnp.array([BUILDING[0] - 0.5, 0.0, 2.0])
-    found = rescue_of(
+    found = RESCUE(
         made.failsafes, replace(no_rescue(), takes_over=jnp.array(True), position_m=position), jnp.asarray(times),
         jnp.float32(5.0 + late_s), position, jnp.float32(1.8), jnp.zeros(3), made.site, jnp.zeros(2),
     )  # fmt: skip
@@ -181,7 +183,7 @@ def test_only_one_in_a_failsafe_that_was_adrift_counts_as_carried_in_calmer_air(
     """A wind failsafe after 60 s must not set in because of a gust of 21 s."""
     rules = world(row("uav", "x500", 1, (0.0, 0.0)), failsafes={"wind": {"after_s": 60.0}}).failsafes
     before = replace(no_rescue(), takes_over=jnp.array(takes_over), carried_s=jnp.float32(carried_s))
-    found, after = failing(
+    found, after = FAILING(
         rules, before, position_m=jnp.array([0.0, 0.0, 5.0]), velocity_m_s=jnp.zeros(3), brake_m_s2=jnp.float32(4.0),
         above_m=jnp.float32(5.0), carried_m_s=jnp.float32(0.0), charge=jnp.float32(1.0), home_m=jnp.zeros(2), dt=0.05,
     )  # fmt: skip
@@ -199,7 +201,7 @@ def test_one_that_is_adrift_beyond_the_fence_lands_there(carried_s, sinks):
     rescue = replace(
         no_rescue(), takes_over=jnp.array(True), position_m=position - 5.0, carried_s=jnp.float32(carried_s)
     )
-    found = rescue_of(made.failsafes, rescue, jnp.asarray(times), jnp.float32(30.0), position, jnp.float32(2.8),
+    found = RESCUE(made.failsafes, rescue, jnp.asarray(times), jnp.float32(30.0), position, jnp.float32(2.8),
                       jnp.zeros(3), made.site, jnp.zeros(2))  # fmt: skip
     assert bool(found.velocity_m_s[2] < -0.5) == sinks
     assert float(found.position_m[0]) < float(made.failsafes.fence_high_m[0])
@@ -230,7 +232,7 @@ def test_one_that_has_landed_comes_to_rest_before_its_part_ends(place, slides):
     )
     group = made.groups[0]
     params, limits = jax.tree.map(lambda x: x[0], (group.params, group.limits))
-    after = record_events(made, group.kind, jnp.float32(2.0), params, limits, one, jnp.array(False))
+    after = RECORDED(made, group.kind, jnp.float32(2.0), params, limits, one, jnp.array(False))
     assert bool(after.active) is slides
 
 
@@ -251,7 +253,7 @@ def test_what_the_wind_carries_to_the_fence_lands_in_time(carried_s, speed, land
     """20 m up and 15 m from the fence: at 3 m/s it would cross before it is down, at 1.2 m/s it would not."""
     rules = world(row("uav", "x500", 1, (0.0, 0.0))).failsafes
     east = float(rules.fence_high_m[0])
-    found, after = failing(
+    found, after = FAILING(
         rules, replace(no_rescue(), carried_s=jnp.float32(carried_s)),
         position_m=jnp.array([east - 15.0, 0.0, 20.0]), velocity_m_s=jnp.array([speed, 0.0, 0.0]),
         brake_m_s2=jnp.float32(4.0), above_m=jnp.float32(20.0), carried_m_s=jnp.float32(speed),
