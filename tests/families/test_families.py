@@ -12,6 +12,7 @@ from swarmsim.config.site_ground import Ground
 from swarmsim.config.values import with_values
 
 SEEDS = range(60)
+BATCH = 8  # missions that fly together, in all tests by the same programs
 STAND = """
 name: stand
 site: meadows
@@ -174,12 +175,12 @@ def test_nuclides_are_those_with_a_strong_line(yard):
 
 
 def test_missions_of_a_family_fly_by_the_same_programs(standing):
-    standing.rollout(range(8), values={"sources.0.activity_mbq": [1000.0] * 8})
-    batch = standing.rollout(range(8, 16))
+    standing.rollout(range(BATCH), values={"sources.0.activity_mbq": [1000.0] * BATCH})
+    batch = standing.rollout(range(BATCH, 2 * BATCH))
     assert not batch.clock.compiled
     single = swarmsim.build(swarmsim.load(standing.scenario.mission_file, ["vary={}", SOURCES]))
-    assert not single.rollout(range(8)).clock.compiled  # the family's programs are those of a single mission
-    assert len({len(swarmsim.mission_record(standing, batch, k).sources) for k in range(8)}) > 1
+    assert not single.rollout(range(BATCH)).clock.compiled  # the family's programs are those of a single mission
+    assert len({len(swarmsim.mission_record(standing, batch, k).sources) for k in range(BATCH)}) > 1
 
 
 SOURCES = "sources=[" + ", ".join(
@@ -188,8 +189,8 @@ SOURCES = "sources=[" + ", ".join(
 
 
 def test_what_was_drawn_is_flown_and_written(standing, tmp_path):
-    batch = standing.rollout(range(4))
-    records = [swarmsim.mission_record(standing, batch, k) for k in range(4)]
+    batch = standing.rollout(range(BATCH))
+    records = [swarmsim.mission_record(standing, batch, k) for k in range(BATCH)]
     for k, record in enumerate(records):
         told, world = standing.draw(k).told(0), batch.worlds.of(k)
         assert record.drawn == told
@@ -217,16 +218,18 @@ def test_what_was_drawn_is_flown_and_written(standing, tmp_path):
 
 
 def test_given_values_come_before_drawn_ones(standing):
-    draws = standing.draw([3, 4])
-    batch = standing.rollout([3, 4], values={"wind.speed_m_s": [1.0, 2.0], "phases.up.settings.height_m": [5.0, 6.0]})
-    told = [swarmsim.mission_record(standing, batch, k).drawn for k in range(2)]
-    assert [row["wind.speed_m_s"] for row in told] == [1.0, 2.0]
-    assert [row["phases.0.settings.height_m"] for row in told] == [5.0, 6.0]
+    seeds = range(3, 3 + BATCH)
+    draws = standing.draw(seeds)
+    winds, heights = [0.5 * k for k in range(BATCH)], [4.0 + 0.5 * k for k in range(BATCH)]
+    batch = standing.rollout(seeds, values={"wind.speed_m_s": winds, "phases.up.settings.height_m": heights})
+    told = [swarmsim.mission_record(standing, batch, k).drawn for k in range(BATCH)]
+    assert [row["wind.speed_m_s"] for row in told] == winds
+    assert [row["phases.0.settings.height_m"] for row in told] == heights
     assert told[0] | {"wind.speed_m_s": 0, "phases.0.settings.height_m": 0} == draws.told(0) | {
         "wind.speed_m_s": 0,
         "phases.0.settings.height_m": 0,
     }
-    same = standing.rollout([3, 4], values=draws.values)
+    same = standing.rollout(seeds, values=draws.values)
     assert (
         dict(swarmsim.mission_record(standing, same, 1).drawn).items()
         >= {path: value for path, value in draws.told(1).items() if not path.endswith("region")}.items()
