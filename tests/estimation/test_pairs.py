@@ -23,8 +23,9 @@ KNOWN, PARAMS = presumed(SITE, DETECTORS), localisation_params(spec())
 CERTAIN = replace(KNOWN, background_std=jnp.float32(0.01), model_std=jnp.float32(0.001), height_std_m=jnp.float32(0.05))
 AT = np.array([*SOURCE[:2], 1.0])
 # compiled once for all tests: what runs piece by piece is compiled anew for each call
-DIVIDED, STRAIN, OF_OTHERS = jax.jit(divided), jax.jit(strain), jax.jit(of_others)
-PROBLEM, SCREEN = jax.jit(problem_of, static_argnums=2), jax.jit(screen_of)
+DIVIDED, JOINED, STRAIN, OF_OTHERS = jax.jit(divided), jax.jit(joined), jax.jit(strain), jax.jit(of_others)
+PROBLEM, SCREEN, ARE_MIXED = jax.jit(problem_of, static_argnums=2), jax.jit(screen_of), jax.jit(are_mixed)
+AS_TWO, ALONG = jax.jit(pairs._as_two), jax.jit(pairs._along)
 
 
 def state_of(truth, given=None, known=KNOWN, seed=None, nuclides=None):
@@ -69,7 +70,7 @@ def test_companions_of_a_nuclide_are_told_as_one(apart, nuclides, one):
     problem, state = state_of(
         [(AT, ACTIVITY)], [(east(apart), 0.02 * ACTIVITY), (AT, ACTIVITY)], seed=3, nuclides=list(nuclides)
     )
-    after, some = joined(problem, state)
+    after, some = JOINED(problem, state)
     assert after.sources.present.tolist() == [not one, True]
     assert bool(some) == one
     share = float(state.sources.activity_bq[0] / jnp.sum(state.sources.activity_bq))
@@ -92,11 +93,11 @@ def joined_by(monkeypatch, places_m, activities, ratios):
     return after.sources
 
 
-def test_of_two_that_stand_for_one_another_one_stays(monkeypatch):
+def test_of_two_that_stand_for_one_another_one_stays():
     """A source 9 m from a stronger one, that is told as two 0.4 m apart: neither of these is missed by itself."""
     truth = [(AT, 248e6), (east(9.0), 351e6)]
     problem, state = state_of(truth, [(AT, 248e6), (east(9.0), 188e6), (east(9.4), 163e6)])
-    after = joined(problem, state)[0].sources
+    after = JOINED(problem, state)[0].sources
     assert int(jnp.sum(after.present)) == 2
     assert bool(after.present[0])
     second = int(jnp.argmax(after.present[1:])) + 1
@@ -146,7 +147,7 @@ def test_two_nuclides_beside_one_another_are_sought_together(apart, off):
     """From where the survey had them: each by itself follows the other, wherever that is."""
     truth = [(AT, 150e6), (east(apart), 200e6, "Cs-137")]
     problem, state = state_of(truth, [(east(off[0]), 150e6), (east(off[1]), 200e6)], nuclides=[0, 1], seed=4)
-    assert bool(are_mixed(state.sources))
+    assert bool(ARE_MIXED(state.sources))
     two, with_first, ratio = DIVIDED(problem, state, jnp.array(True))
     assert float(ratio) > float(PARAMS.search.further)
     first, slot = int(two.number), int(two.slot)
@@ -166,11 +167,11 @@ def test_a_step_of_both_leads_from_beside_two_sources_to_them(nuclides):
     off = np.array([[0.3, -0.1, 0.0], [0.1, 0.3, 0.0]])
     given = [(place, 200e6) for place in at + off]
     problem, state = state_of(truth, given, CERTAIN, nuclides=list(nuclides))
-    two = pairs._as_two(
+    two = AS_TWO(
         problem, without(state, jnp.int32(1)), jnp.int32(0), jnp.int32(1), jnp.float32(1.0), jnp.int32(nuclides[1]),
         jnp.asarray([[0.0, 0.0, 0.0], given[1][0] - given[0][0]], jnp.float32),
     )  # fmt: skip
-    changes = np.asarray(pairs._along(problem, without(state, jnp.int32(1)), two, jnp.float32(2.0)))
+    changes = np.asarray(ALONG(problem, without(state, jnp.int32(1)), two, jnp.float32(2.0)))
     left = np.linalg.norm((at + off + changes[0] - at)[:, :2], axis=1)
     assert (left < 0.25 * np.linalg.norm(off, axis=1)).all()
     # and those that are drawn spread about it
@@ -234,8 +235,8 @@ def test_two_nuclides_are_placed_together_if_that_is_what_was_wrong(monkeypatch,
 def test_mixed_are_two_of_different_nuclides_beside_one_another():
     for apart, nuclides, mixed in ((4.0, [0, 1], True), (4.0, [1, 1], False), (14.0, [0, 1], False)):
         _, state = state_of([(AT, ACTIVITY), (east(apart), ACTIVITY)], nuclides=nuclides)
-        assert bool(are_mixed(state.sources)) == mixed
-        assert not bool(are_mixed(without(state, jnp.int32(0)).sources))
+        assert bool(ARE_MIXED(state.sources)) == mixed
+        assert not bool(ARE_MIXED(without(state, jnp.int32(0)).sources))
 
 
 def test_one_source_strains_nothing_and_two_taken_for_one_do():
