@@ -5,23 +5,34 @@ the shape of the spectrum then tells a source from a background that varies from
 """
 
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.forward import Problem, Rates, Ways, detector_of, lengthened, rates, silent, variance_of
+from swarmsim.device import thread_by_thread
+from swarmsim.estimation.forward import Problem, Rates, Ways, lengthened, rates, silent, variance_of
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.estimation.normal_equations import (
     MEAN_FLOOR,
     Linearised,
     Others,
+    Sums,
     Unknowns,
     linearised,
     log_likelihood,
     log_prior,
+    moved,
     normal_equations,
+    nothing_told,
+    shared_equations,
+    shared_prior,
+    step_of,
     stepped,
+    sums_of,
 )
+from swarmsim.estimation.window_threads import own_steps_by_threads, sums_by_threads
 from swarmsim.pytree import pytree
 from swarmsim.site import sample
 
@@ -71,48 +82,93 @@ def settle(
             else they are extrapolated (`lengthened`; static).
     """
     passes = [steps, MORE_STEPS] if exact and problem.uncertain else [steps]
+    Carry = tuple[Unknowns, Rates, jax.Array, Sums | None]
 
-    def linear(u: Unknowns, source: Rates) -> Linearised:
-        return linearised(problem, source, others, ways.position_m, u)
-
-    def step(_: int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
-        u, source = carry
-        moved = stepped(problem, u, normal_equations(problem, linear(u, source), u))
-        return moved, lengthened(source, moved.lengths - u.lengths)
-
-    def pass_(number: jax.Array | int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
-        u, _ = carry
-        source = rates(problem, ways, nuclide, u.lengths)
+    def pass_(number: jax.Array | int, carry: Carry) -> Carry:
+        u, _, _, sums = carry
+        begun = u.lengths
+        source = rates(problem, ways, nuclide, begun)
         if fresh:
             u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, ways.position_m, u), lambda: u)
-        return jax.lax.fori_loop(0, jnp.array(passes)[number], step, (u, source))
+        at = partial(_Fit, problem, source, begun, others, ways.position_m)
+        count = jnp.array(passes)[number]
+        if not thread_by_thread():
+            return jax.lax.fori_loop(0, count, lambda _, u: at(u).stepped(), u), source, begun, None
 
+        def look(done: jax.Array, carry: tuple[Unknowns, Sums | None]) -> tuple[Unknowns, Sums]:
+            sums = at(carry[0]).sums()
+            return jax.lax.cond(done < count, at(carry[0]).moved, lambda _: carry[0], sums), sums
+
+        # what the windows tell is a kernel that takes long to compile: the last look is one of the same loop
+        u, sums = jax.lax.fori_loop(0, count + (number == len(passes) - 1), look, (u, sums))
+        return u, source, begun, sums
+
+    nothing = nothing_told(problem, start) if thread_by_thread() else None
     # a loop, so that what a pass does is compiled once
-    u, source = jax.lax.fori_loop(0, len(passes), pass_, (start, silent(problem)))
-    return _settled(problem, linear(u, source), u, ways, source)
+    u, source, begun, sums = jax.lax.fori_loop(
+        0, len(passes), pass_, (start, silent(problem), start.lengths, nothing)
+    )  # fmt: skip
+    found = _Fit(problem, source, begun, others, ways.position_m, u)
+    return _settled(problem, ways, u, found.sums() if sums is None else sums, found.source())
+
+
+class _Fit(NamedTuple):
+    """A source with rates that were computed for lengths ``begun`` [U], and all unknowns."""
+
+    problem: Problem
+    computed: Rates
+    begun: jax.Array
+    others: Others
+    where: jax.Array  # [3]
+    u: Unknowns
+
+    def source(self) -> Rates:
+        """The rates at the lengths."""
+        return lengthened(self.computed, self.u.lengths - self.begun)
+
+    def model(self) -> Linearised:
+        """The model at the unknowns."""
+        return linearised(self.problem, self.source(), self.others, self.where, self.u)
+
+    def sums(self) -> Sums:
+        """What all windows tell."""
+        if not thread_by_thread():
+            return sums_of(self.problem, self.model(), self.u)
+        change = self.u.lengths - self.begun
+        return sums_by_threads(self.problem, self.computed, change, self.others, self.where, self.u)
+
+    def stepped(self) -> Unknowns:
+        """The unknowns after a Gauss-Newton step."""
+        return stepped(self.problem, self.u, normal_equations(self.problem, self.model(), self.u))
+
+    def moved(self, sums: Sums) -> Unknowns:
+        """The same `thread_by_thread`, from the sums."""
+        step, change = step_of(*shared_equations(self.problem, sums, self.u)[0]), self.u.lengths - self.begun
+        own = own_steps_by_threads(self.problem, self.computed, change, self.others, self.where, self.u, step)
+        return moved(self.u, step, own)
 
 
 @jax.jit  # traced once for all places of a program that call it
-def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, source: Rates) -> Settled:
-    at = normal_equations(problem, model, u)
+def _settled(problem: Problem, ways: Ways, u: Unknowns, sums: Sums, source: Rates) -> Settled:
+    (information, _), (towards, pull) = shared_equations(problem, sums, u)
     height = ways.position_m[2] - sample(problem.site.terrain_m, problem.site, ways.position_m[:2])
     precise, above = height_precision(problem.height_std_m), height - problem.height_m
-    likelihood = log_likelihood(problem, model) + log_prior(problem, model, u) - 0.5 * precise * jnp.square(above)
-    towards, pull = at.towards.at[2, 2].add(precise), at.pull.at[2].add(-precise * above)
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(at.information), 1e-20))
-    unit = at.information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
+    likelihood = sums.likelihood + sums.prior + shared_prior(problem, u) - 0.5 * precise * jnp.square(above)
+    precisely = towards.at[2, 2].add(precise)
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 1e-20))
+    unit = information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
     root = jax.scipy.linalg.cholesky(unit, lower=True)
     log_volume = -jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(scale))
     # where nothing is left of an activity its logarithm says nothing
     excess = (jnp.log(jnp.maximum(u.activity_bq, 1.0)) - problem.log_activity) / problem.log_activity_std
-    value = likelihood + log_volume + at.log_volume - 0.5 * jnp.square(excess)
+    value = likelihood + log_volume + sums.log_volume - 0.5 * jnp.square(excess)
     return Settled(
         value=jnp.where(jnp.isfinite(value), value, -jnp.inf),
         likelihood=jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf),
         unknowns=u,
-        covariance=scaled_inverse(at.information),
-        towards=at.towards,
-        move=scaled_inverse(towards + jnp.eye(3) * FLAT) @ pull,
+        covariance=scaled_inverse(information),
+        towards=towards,
+        move=scaled_inverse(precisely + jnp.eye(3) * FLAT) @ pull.at[2].add(-precise * above),
         rates=source,
     )
 
@@ -129,7 +185,7 @@ def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u:
     unit = jnp.maximum(jnp.max(jnp.where(m.valid, jnp.sum(source.counts, axis=1), 0.0)), 1e-30)
     net = source.counts / unit
     rest = jnp.sum(others.counts * u.others[:, None, None], axis=0)
-    background = problem.background * jnp.exp(detector_of(problem) @ u.level)[:, None]
+    background = problem.background * jnp.exp(problem.detector @ u.level)[:, None]
     left = m.rois - rest - background
     weight = problem.trust / jnp.maximum(jnp.maximum(m.rois, rest + background), MEAN_FLOOR)
     weight = jnp.where(m.valid[:, None], weight, 0.0)

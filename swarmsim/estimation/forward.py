@@ -4,37 +4,24 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.estimation.likelihood import position_of, travel_gain
+from swarmsim.device import at_most, thread_by_thread
+from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.measurements import Measurements
+from swarmsim.estimation.node_rates import alike, at_nodes, at_nodes_by_threads, sums_of_rays
+from swarmsim.estimation.nodes import Nodes, Span, nodes_of
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.rate import registered_share, roi_rates_and_slopes
-from swarmsim.site import Site, sample
-from swarmsim.site.rays import Crossed, crossed_from, stretched
+from swarmsim.radiation.rate import RoiRates, lines_of, lines_with_photons, share_registered
+from swarmsim.site import Site
+from swarmsim.site.rays import Crossed, crossed_from
 
-LEAST_ABOVE_M = 0.2  # height of a crystal above the ground
 EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
-
-
-Span = tuple[int, int, int, int]
-"""Rows from, to, their detector model, and the rays to each window along its way."""
-
-
-@pytree
-class Nodes:
-    """Where the crystal is looked at from a source: ``rays`` places of each of m windows.
-
-    Each stands for the part of the way that is nearest to it: two straight pieces, one before it and one after.
-    """
-
-    position_m: jax.Array  # [rays m, 3]
-    axis: jax.Array  # [rays m, 3]
-    pieces_m: jax.Array  # [rays m, 2, 3] from the place to the beginning of its part, and to the end
 
 
 @pytree
@@ -56,7 +43,9 @@ class Problem:
     trust: jax.Array  # [n, R] 0..1: the counts of a region in a window are worth so many times as many (`trust_of`)
     height_m: jax.Array  # [] prior of a source's height above ground
     height_std_m: jax.Array  # []
-    nodes: tuple[Nodes, ...]  # of each span
+    detector: jax.Array  # [n, D] one-hot: the detector model of each row
+    dead_s: jax.Array  # [n, 2] its dead times, the paralyzable and the non-paralyzable one
+    nodes: Nodes  # of all windows
     spans: tuple[Span, ...] = static()
     uncertain: tuple[int, ...] = static()  # numbers of the U materials whose thickness is not known exactly
 
@@ -74,68 +63,8 @@ class Rates:
 class Ways:
     """What lies between a place and the windows."""
 
-    crossed: tuple[Crossed, ...]  # for each span [rays m, M]
+    crossed: Crossed  # [nodes, M]
     position_m: jax.Array  # [3] of the place
-
-
-def nodes_of(site: Site, m: Measurements, span: Span) -> Nodes:
-    """The nodes of a span's windows.
-
-    With one ray a window has its middle; with more the first and the last end of the way are among them, so that a
-    shadow's edge that a window crosses is seen in the spread between its rays. A way is two straight legs of equal
-    time, which the ends and the mean place tell: the corner between them lies as far beyond the mean as this lies off
-    the straight line between the ends. No place is taken to lie below the ground.
-    """
-    first, last, _, rays = span
-    mean, travel, axis = (x[first:last] for x in (m.position_m, m.travel_m, m.axis))
-    chord = jnp.zeros_like(travel) if m.chord_m is None else m.chord_m[first:last]
-    corner = -2.0 * chord
-    # a vehicle that stands for long and drives off at last, or drives in circles, has no two legs of equal time
-    length, off = (jnp.linalg.norm(x, axis=-1, keepdims=True) for x in (travel, corner))
-    corner = corner * jnp.minimum(1.0, 0.5 * length / jnp.maximum(off, 1e-6))
-
-    def at(share: jax.Array) -> jax.Array:
-        """Places [m, ..., 3] at so much of the way."""
-        along, beside = share[..., None] - 0.5, 1.0 - jnp.abs(2.0 * share[..., None] - 1.0)
-        return (mean + chord)[:, None] + along * travel[:, None] + beside * corner[:, None]
-
-    share, low, high = _parts(rays)
-    position = at(share)
-    pieces = jnp.stack([at(low) - position, at(high) - position], axis=2)
-    ground = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(position[..., :2].reshape(-1, 2))
-    position = position.reshape(-1, 3)
-    return Nodes(
-        position_m=position.at[:, 2].max(ground + LEAST_ABOVE_M),
-        axis=jnp.repeat(axis, rays, axis=0),
-        pieces_m=pieces.reshape(-1, 2, 3),
-    )
-
-
-def _parts(rays: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Where on a way its nodes [rays] are, and where the parts that they stand for begin and end."""
-    share = jnp.linspace(0.0, 1.0, rays) if rays > 1 else jnp.array([0.5])
-    half = 0.5 / max(rays - 1, 1)
-    return share, jnp.maximum(share - half, 0.0), jnp.minimum(share + half, 1.0)
-
-
-def shares_of(rays: int) -> jax.Array:
-    """Shares [rays] of a way that its nodes stand for."""
-    _, low, high = _parts(rays)
-    return high - low
-
-
-def inverse_square_gain(offset_m: jax.Array, pieces_m: jax.Array, rays: int) -> jax.Array:
-    """Mean of 1/r² [rays m] over the parts of the ways over its value at their nodes.
-
-    ``offset_m`` [rays m, 3] from the source to the nodes, ``pieces_m`` [rays m, 2, 3] as those of `Nodes`.
-    """
-    share, low, high = _parts(rays)
-    weight = jnp.stack([share - low, high - share], axis=1) / (high - low)[:, None]  # [rays, 2]
-    middle = offset_m[:, None] + 0.5 * pieces_m
-    squared = jnp.maximum(jnp.sum(middle * middle, axis=-1), 1e-6)
-    mean = travel_gain(middle, pieces_m) / squared
-    mean = jnp.sum(weight * mean.reshape(-1, rays, 2), axis=-1).reshape(-1)
-    return jnp.sum(offset_m * offset_m, axis=-1) * mean
 
 
 @jax.jit  # traced once for all places of a program that call it
@@ -143,42 +72,72 @@ def ways_from(problem: Problem, place: jax.Array) -> Ways:
     """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
     position, valid = position_of(problem.site, place), problem.measurements.valid
     wanted = jnp.concatenate([jnp.repeat(valid[first:last], rays) for first, last, _, rays in problem.spans])
-    ends = jnp.concatenate([nodes.position_m for nodes in problem.nodes])
-    # of all spans at once: it is compiled at several places
-    every = crossed_from(problem.site, position, ends, wanted)
-    rows = np.cumsum([0, *(nodes.position_m.shape[0] for nodes in problem.nodes)])
-    crossed = tuple(
-        jax.tree.map(lambda x, part=slice(first, last): x[part], every)
-        for first, last in itertools.pairwise(rows.tolist())
-    )
+    crossed = crossed_from(problem.site, position, problem.nodes.position_m, wanted)
     return Ways(crossed=crossed, position_m=position)
 
 
-@jax.jit  # traced once for all places of a program that call it
-def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array) -> Rates:
+@partial(jax.jit, static_argnames="slopes")  # traced once for all places of a program that call it
+def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array, slopes: bool = True) -> Rates:
     """Counts per Bq of a source of ``nuclide``.
 
-    ``lengths`` [U] are logarithms of the factors of the path lengths in the uncertain materials.
+    ``lengths`` [U] are logarithms of the factors of the path lengths in the uncertain materials. Without ``slopes``
+    (static) there are none: [n, 0, R].
     """
     materials = len(problem.site.material_names)
     factors = jnp.ones(materials).at[jnp.array(problem.uncertain, jnp.int32)].set(jnp.exp(lengths))
     source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
+    by = problem.uncertain if slopes else ()
+    valid = problem.measurements.valid
+    asked = [jnp.any(valid[first:last]) for first, last, _, _ in problem.spans]
+    found = _at_all_nodes(problem, ways.crossed, asked, source, factors, by)
     parts = [
-        _rates_of_span(problem, span, nodes, source, stretched(crossed, factors))
-        for span, nodes, crossed in zip(problem.spans, problem.nodes, ways.crossed, strict=True)
+        _of_windows(problem, span, nodes, source, own)
+        for span, nodes, own in zip(problem.spans, _by_span(problem, problem.nodes), found, strict=True)
     ]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
-def _rates_of_span(problem: Problem, span: Span, nodes: Nodes, source: Source, way: Crossed) -> Rates:
-    first, last, number, rays = span
-    share, position = shares_of(rays), nodes.position_m
-    offset = position - source.position_m
-    detector, exposure = problem.detectors[number], problem.measurements.exposure_s[first:last]
-    weight = jnp.tile(share, last - first) * inverse_square_gain(offset, nodes.pieces_m, rays)
-    asked = jnp.any(problem.measurements.valid[first:last])
-    found = roi_rates_and_slopes(detector, source, way, position, nodes.axis, problem.uncertain, weight, rays, asked)
-    strength = (found.net * jnp.sum(offset * offset, axis=1)).reshape(-1, rays)
+def _by_span(problem: Problem, x: Any) -> list[Any]:
+    """The rows of each span, of arrays of all nodes."""
+    ends = itertools.accumulate((last - first) * rays for first, last, _, rays in problem.spans)
+    return [jax.tree.map(lambda x, part=slice(*part): x[part], x) for part in itertools.pairwise([0, *ends])]
+
+
+def _at_all_nodes(
+    problem: Problem,
+    crossed: Crossed,
+    asked: Sequence[jax.Array],
+    source: Source,
+    factors: jax.Array,
+    by: tuple[int, ...],
+) -> list[RoiRates]:
+    """Rates of the windows of each span that is ``asked`` [] for; of the others they mean nothing."""
+    detectors, rays = [problem.detectors[number] for _, _, number, _ in problem.spans], [s[3] for s in problem.spans]
+    parts = list(zip(_by_span(problem, crossed), _by_span(problem, problem.nodes), strict=True))
+    if not thread_by_thread():
+        return [
+            at_nodes(*part, d, lines_of(d, source.nuclide, of), source, factors, by=by, places=places)
+            for part, d, of, places in zip(parts, detectors, asked, rays, strict=True)
+        ]
+    together = partial(at_nodes_by_threads, source=source, factors=factors, by=by)
+    counts = [jnp.where(of, lines_with_photons(d, source.nuclide), 0) for d, of in zip(detectors, asked, strict=True)]
+    if alike(detectors):
+        which = np.concatenate([np.full((last - first) * n, k) for k, (first, last, _, n) in enumerate(problem.spans)])
+        count = at_most(jnp.max(jnp.stack(counts)))
+        every = _by_span(problem, together(crossed, problem.nodes, which, detectors, count))
+    else:
+        every = [
+            together(*part, np.zeros(part[1].axis.shape[0]), [d], at_most(count))
+            for part, d, count in zip(parts, detectors, counts, strict=True)
+        ]
+    return [sums_of_rays(found, places) for found, places in zip(every, rays, strict=True)]
+
+
+def _of_windows(problem: Problem, span: Span, nodes: Nodes, source: Source, found: RoiRates) -> Rates:
+    first, last, _, rays = span
+    exposure, offset = problem.measurements.exposure_s[first:last], nodes.position_m - source.position_m
+    strength, share = found.net * jnp.sum(offset * offset, axis=1), jnp.sum(nodes.pieces, axis=1)
+    strength, share = strength.reshape(-1, rays), share.reshape(-1, rays)
     mean = jnp.sum(share * strength, axis=1)
     spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)
     regions = problem.background.shape[1]
@@ -196,15 +155,8 @@ def padded(values: jax.Array, regions: int) -> jax.Array:
 
 def dead_time(problem: Problem, counts: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Share [n] of the true counts [n] of each window that is registered, and its derivative by them."""
-    exposure = jnp.maximum(problem.measurements.exposure_s, 1e-9)
-    shares, slopes = [], []
-    for first, last, number, _ in problem.spans:
-        live, law = exposure[first:last], partial(registered_share, problem.detectors[number])
-        rate = counts[first:last] / live
-        share, slope = jax.jvp(law, (rate,), (1.0 / live,))
-        shares.append(share)
-        slopes.append(slope)
-    return jnp.concatenate(shares), jnp.concatenate(slopes)
+    live, (paralyzable, non_paralyzable) = jnp.maximum(problem.measurements.exposure_s, 1e-9), problem.dead_s.T
+    return jax.jvp(lambda rate: share_registered(rate, paralyzable, non_paralyzable), (counts / live,), (1.0 / live,))
 
 
 def trust_of(counts: jax.Array, background: jax.Array, std: jax.Array) -> jax.Array:
@@ -231,8 +183,7 @@ def lengthened(source: Rates, change: jax.Array) -> Rates:
 def with_one_ray(problem: Problem) -> Problem:
     """The same with one ray to each window."""
     spans = tuple((first, last, number, 1) for first, last, number, _ in problem.spans)
-    nodes = tuple(nodes_of(problem.site, problem.measurements, span) for span in spans)
-    return replace(problem, spans=spans, nodes=nodes)
+    return replace(problem, spans=spans, nodes=nodes_of(problem.site, problem.measurements, spans))
 
 
 def silent(problem: Problem) -> Rates:
@@ -249,20 +200,8 @@ def variance_of(problem: Problem, where: jax.Array) -> jax.Array:
     return jnp.square(problem.model_std) + 4.0 * jnp.square(problem.pose_std_m) / squared
 
 
-def detector_of(problem: Problem) -> jax.Array:
-    """One-hot [n, D]: the detector model of each row."""
-    rows = [jnp.full(last - first, number) for first, last, number, _ in problem.spans]
-    return jax.nn.one_hot(jnp.concatenate(rows), len(problem.detectors))
-
-
-def spans_of(groups: Sequence[tuple[int, int, int]]) -> tuple[Span, ...]:
-    """Spans from (rows, detector, rays) of groups that follow one another; neighbours that are alike are one span."""
-    spans: list[Span] = []
-    at = 0
-    for size, detector, rays in groups:
-        if spans and spans[-1][2:] == (detector, rays):
-            spans[-1] = (spans[-1][0], at + size, detector, rays)
-        elif size:
-            spans.append((at, at + size, detector, rays))
-        at += size
-    return tuple(spans)
+def models_of(detectors: Sequence[Detector], spans: Sequence[Span]) -> tuple[jax.Array, jax.Array]:
+    """Detector model of each row, one-hot [n, D], and its dead times [n, 2]: see `Problem`."""
+    rows = np.concatenate([np.full(last - first, number) for first, last, number, _ in spans])
+    dead = jnp.stack([jnp.stack([jnp.asarray(d.paralyzable_s), jnp.asarray(d.non_paralyzable_s)]) for d in detectors])
+    return jax.nn.one_hot(rows, len(detectors)), dead[rows]

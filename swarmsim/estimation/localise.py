@@ -14,10 +14,11 @@ import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
 from swarmsim.config.sources import ACTIVITY_MAX_MBQ
-from swarmsim.estimation.forward import Problem, Span, nodes_of, padded, trust_of
+from swarmsim.estimation.forward import Problem, models_of, padded, trust_of
 from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.likelihood import natural_background, position_covariance
 from swarmsim.estimation.measurements import Measurements, cleared
+from swarmsim.estimation.nodes import Span, nodes_of
 from swarmsim.estimation.pairs import strain
 from swarmsim.estimation.posterior import of_others, posteriors
 from swarmsim.estimation.seek import SearchParams
@@ -217,6 +218,7 @@ def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span
         ]
     )
     travel = jnp.sum(jnp.square(m.travel_m), axis=-1)
+    detector, dead_s = models_of(presumed.detectors, spans)
     background = nominal * (natural * m.exposure_s)[:, None]
     return Problem(
         site=presumed.site,
@@ -234,7 +236,9 @@ def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span
         pose_std_m=jnp.sqrt(jnp.square(presumed.pose_std_m) + WAY_SHARE**2 * travel),
         height_m=jnp.asarray(presumed.height_m),
         height_std_m=jnp.asarray(presumed.height_std_m),
-        nodes=tuple(nodes_of(presumed.site, m, span) for span in spans),
+        detector=detector,
+        dead_s=dead_s,
+        nodes=nodes_of(presumed.site, m, spans),
         spans=spans,
         uncertain=presumed.uncertain,
     )

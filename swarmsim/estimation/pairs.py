@@ -275,7 +275,7 @@ def _as_two(
     s, (low, high) = state.sources, bounds(problem)
     place = jnp.clip(s.place[k] + offset_m, low, high)
     ways = ways_from(problem, place[0])
-    found = rates(problem, ways, s.nuclide[k], state.unknowns.lengths)
+    found = rates(problem, ways, s.nuclide[k], state.unknowns.lengths, slopes=False)
     first = Others(
         counts=share * s.activity_bq[k] * found.counts, variance=variance_of(problem, ways.position_m) + found.edge
     )

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.device import each
-from swarmsim.estimation.forward import Problem, detector_of, padded, silent
+from swarmsim.estimation.forward import Problem, padded, silent
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations, of_window
 from swarmsim.pytree import on_device, pytree
 from swarmsim.radiation.detector import Detector, Source
@@ -67,7 +67,7 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     mean, columns, of_own = model.mean.T, model.columns.T, of_window(model.columns, u.others.shape[0]).T
     own_inverse, own_push = at.own.T, at.own_push.T
     weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(mean, MEAN_FLOOR), 0.0)
-    names, models = problem.detectors[0].material_names, detector_of(problem)
+    names, models = problem.detectors[0].material_names, problem.detector
     air = names.index("air") if "air" in names else 0
     kernels = [padded(open_rates(d, allowed.shape[0], air), regions) for d in problem.detectors]
     kernel = jnp.stack(kernels)  # [D, N, J, R]
@@ -123,7 +123,7 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
 
 
 def _true(problem: Problem, others: Others, u: Unknowns) -> jax.Array:
-    background = problem.background * jnp.exp(detector_of(problem) @ u.level + u.background)[:, None]
+    background = problem.background * jnp.exp(problem.detector @ u.level + u.background)[:, None]
     return background + jnp.sum(others.counts * u.others[:, None, None], axis=0) * jnp.exp(u.gain)[:, None]
 
 

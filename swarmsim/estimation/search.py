@@ -131,7 +131,7 @@ class _Seen:
 
 def _seen(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> _Seen:
     lengths = jnp.zeros_like(problem.material_std)
-    net = rates(problem, ways_from(problem, place), nuclide, lengths).counts.T * screen.registered
+    net = rates(problem, ways_from(problem, place), nuclide, lengths, slopes=False).counts.T * screen.registered
     weighted = screen.weight * net
     own, inverse = _own(screen, nuclide, net)
     inside = jnp.sum(own * weighted, axis=1)

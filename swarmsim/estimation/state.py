@@ -71,7 +71,7 @@ def signals(problem: Problem, s: Sources, lengths: jax.Array) -> Others:
 
         def seen() -> Others:
             ways = ways_from(problem, place)
-            found = rates(problem, ways, nuclide, lengths)
+            found = rates(problem, ways, nuclide, lengths, slopes=False)
             return Others(counts=activity * found.counts, variance=variance_of(problem, ways.position_m) + found.edge)
 
         return for_those(there, seen, lambda: Others(counts=jnp.zeros((n, regions)), variance=jnp.zeros(n)))

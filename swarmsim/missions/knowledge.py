@@ -15,7 +15,7 @@ from swarmsim.estimation import (
     interpolate,
     localise,
 )
-from swarmsim.estimation.forward import Span, spans_of
+from swarmsim.estimation.nodes import Span, spans_of
 from swarmsim.estimation.state import State
 from swarmsim.estimation.windows import Windows, measured, merged
 from swarmsim.missions.plan import Plan

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.device import at_most, on_processor
+from swarmsim.device import at_most, on_processor, thread_by_thread
+from swarmsim.pytree import pytree, static
 from swarmsim.radiation.cylinder import NEAR_TABLES, direction_basis, near_ratio
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.lines import SPECTRUM_DEPTHS
@@ -172,7 +173,12 @@ def registered_share(detector: Detector, rate_cps: jax.Array) -> jax.Array:
     Hybrid law m / n = exp(-n t_p) / (1 + n t_n) of Lee and Gardner (Applied Radiation and Isotopes 53, 2000, 731),
     which is the paralyzable law for t_n = 0, the non-paralyzable one for t_p = 0, and 1 when both are 0.
     """
-    return jnp.exp(-rate_cps * detector.paralyzable_s) / (1.0 + rate_cps * detector.non_paralyzable_s)
+    return share_registered(rate_cps, detector.paralyzable_s, detector.non_paralyzable_s)
+
+
+def share_registered(rate_cps: jax.Array, paralyzable_s: jax.Array, non_paralyzable_s: jax.Array) -> jax.Array:
+    """`registered_share` [...] of detectors with these dead times [...]."""
+    return jnp.exp(-rate_cps * paralyzable_s) / (1.0 + rate_cps * non_paralyzable_s)
 
 
 def highest_rate(detector: Detector) -> float:
@@ -231,6 +237,23 @@ def roi_rates(detector: Detector, source: Source, way: Crossed, position_m: jax.
     return direct @ detector.peak_rois[source.nuclide] + jnp.einsum("l,lr->r", scattered, shares) + of_ground
 
 
+@pytree
+class Lines:
+    """The lines of one nuclide: what of a detector's tables is theirs."""
+
+    packed: jax.Array  # [L, entries] a row for each: then a thread of an accelerator reads the entries of one alone
+    count: jax.Array  # [] int32 of those that have photons
+    shapes: tuple[tuple[str, tuple[int, ...]], ...] = static()  # of each table, of one line of one nuclide
+
+    def tables(self, row: jax.Array) -> dict[str, Any]:
+        """The tables of the line of a row, as if it were the only one of the only nuclide."""
+        found, first = {}, 0
+        for name, shape in self.shapes:
+            last = first + int(np.prod(shape))
+            found[name], first = row[first:last].reshape(shape), last
+        return found
+
+
 class RoiRates(NamedTuple):
     """Rates by region of interest on m ways, of n places on them in all."""
 
@@ -248,7 +271,7 @@ def roi_rates_and_slopes(
     by: tuple[int, ...] = (),
     weight: jax.Array | None = None,
     places: int = 1,
-    asked: jax.Array | bool = True,
+    lines: Lines | None = None,
 ) -> RoiRates:
     """`roi_rates` with their derivatives at n places, or sums of them over some places at a time.
 
@@ -263,36 +286,31 @@ def roi_rates_and_slopes(
         by: numbers of U materials (static).
         weight: [n] of the places in the sums; 1 by default.
         places: in a sum, neighbours (static).
-        asked: [] bool; where it is False rates mean nothing, and cost next to nothing if none of a batch are asked for.
+        lines: of the source's nuclide, if they are known already (`lines_of`).
     """
     given = jnp.ones(axis.shape[0]) if weight is None else weight
-    lines = _lines_of(detector, source.nuclide)
+    own = lines_of(detector, source.nuclide) if lines is None else lines
     one = replace(source, nuclide=jnp.int32(0))
-
-    def of(line: dict[str, Any]) -> RoiRates:
-        return _of_line(replace(detector, **line), one, way, position_m, axis, by, given, places)
-
-    n, regions = axis.shape[0], detector.peak_rois.shape[-1]
-    m, together = n // places, 1 if on_processor() else LINES_TOGETHER
-    # most nuclides have fewer lines than the tables have rows
-    count = jnp.max(jnp.where(detector.yields[source.nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
-    count = jnp.where(asked, count, 0)
+    n, regions = axis.shape[0], dict(own.shapes)["peak_rois"][-1]
+    m = n // places
     nothing = RoiRates(jnp.zeros((m, regions)), jnp.zeros((m, len(by), regions)), jnp.zeros(n))
 
+    def of(row: jax.Array) -> RoiRates:
+        return _of_line(replace(detector, **own.tables(row)), one, way, position_m, axis, by, given, places)
+
+    together = 1 if on_processor() or thread_by_thread() else LINES_TOGETHER
+    if together == 1:
+        return jax.lax.fori_loop(
+            0, own.count, lambda number, sums: jax.tree.map(jnp.add, sums, of(own.packed[number])), nothing
+        )
+    # a line without photons adds nothing
+    rows = jnp.pad(own.packed, [(0, -own.packed.shape[0] % together), (0, 0)])
+
     def add(number: jax.Array, sums: RoiRates) -> RoiRates:
-        if together == 1:
-            return jax.tree.map(jnp.add, sums, of(jax.tree.map(lambda x: x[number], lines)))
-        # a line without photons adds nothing
-        own = {name: _rows(x, number * together, together) for name, x in lines.items()}
-        return jax.tree.map(lambda old, new: old + jnp.sum(new, axis=0), sums, jax.vmap(of)(own))
+        some = jax.vmap(of)(jax.lax.dynamic_slice_in_dim(rows, number * together, together))
+        return jax.tree.map(lambda old, new: old + jnp.sum(new, axis=0), sums, some)
 
-    return jax.lax.fori_loop(0, at_most(-(-count // together)), add, nothing)
-
-
-def _rows(x: jax.Array, first: jax.Array, count: int) -> jax.Array:
-    """Rows [count, ...] from the ``first`` on; zeros beyond the last one."""
-    padded = jnp.pad(x, [(0, -x.shape[0] % count)] + [(0, 0)] * (x.ndim - 1))
-    return jax.lax.dynamic_slice_in_dim(padded, first, count)
+    return jax.lax.fori_loop(0, -(-own.count // together), add, nothing)
 
 
 _LINES = {
@@ -302,10 +320,33 @@ _LINES = {
 """Tables that rates by region take from a detector, and the axis of the lines in those of a nuclide."""
 
 
-def _lines_of(detector: Detector, nuclide: jax.Array) -> dict[str, jax.Array]:
-    """Those tables of each line [L, 1, ...], as if it were the only one of the only nuclide."""
-    of = {name: jnp.moveaxis(jnp.asarray(getattr(detector, name))[nuclide], axis, 0) for name, axis in _LINES.items()}
-    return {name: jnp.expand_dims(of[name], (1, 2 + axis)) for name, axis in _LINES.items()}
+def lines_of(detector: Detector, nuclide: jax.Array, asked: jax.Array | bool = True) -> Lines:
+    """The lines of a nuclide [] as `roi_rates_and_slopes` takes them; none unless it is ``asked`` [] for them."""
+    packed, shapes = packed_lines(detector, nuclide)
+    # of many, all go on as long as any: a line without photons adds nothing, and to leave it out costs more
+    return Lines(
+        packed=packed, count=at_most(jnp.where(asked, lines_with_photons(detector, nuclide), 0)), shapes=shapes
+    )
+
+
+def lines_with_photons(detector: Detector, nuclide: jax.Array) -> jax.Array:
+    """Number [] of lines of a nuclide []: most have fewer than the tables have rows."""
+    return jnp.max(jnp.where(detector.yields[nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
+
+
+def packed_lines(
+    detector: Detector, nuclide: jax.Array | None = None
+) -> tuple[jax.Array, tuple[tuple[str, tuple[int, ...]], ...]]:
+    """Tables of all lines [N, L, entries], or of a nuclide's [L, entries]; and the shapes of `Lines`."""
+    rows, shapes = [], []
+    for name, axis in _LINES.items():
+        table = jnp.asarray(getattr(detector, name))
+        lead = 1 if nuclide is None else 0
+        row = jnp.moveaxis(table if nuclide is None else table[nuclide], lead + axis, lead)
+        front, own = row.shape[: lead + 1], row.shape[lead + 1 :]
+        rows.append(row.reshape(*front, -1))
+        shapes.append((name, (1, *own[:axis], 1, *own[axis:])))
+    return jnp.concatenate(rows, axis=-1), tuple(shapes)
 
 
 def _of_line(

@@ -13,7 +13,7 @@ from scipy.stats import chi2, kstest
 import swarmsim
 from swarmsim.config.files import packaged_dir
 from swarmsim.estimation import Measurements, cramer_rao_covariance, fisher_information, localise
-from swarmsim.estimation.forward import spans_of
+from swarmsim.estimation.nodes import spans_of
 from swarmsim.estimation.windows import gather, measured, merged, windows_start
 from swarmsim.radiation import draw_counts, observed_rois
 from swarmsim.radiation.background import background_factor
