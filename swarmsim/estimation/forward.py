@@ -17,7 +17,8 @@ from swarmsim.estimation.node_rates import alike, at_nodes, at_nodes_by_threads,
 from swarmsim.estimation.nodes import Nodes, Span, nodes_of
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.rate import RoiRates, lines_of, lines_with_photons, share_registered
+from swarmsim.radiation.rate import share_registered
+from swarmsim.radiation.roi_lines import RoiRates, lines_of, lines_with_photons
 from swarmsim.site import Site
 from swarmsim.site.rays import Crossed, crossed_from
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from swarmsim.estimation.nodes import Nodes, inverse_square_gain
 from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.rate import Lines, RoiRates, packed_lines, roi_rates_and_slopes
+from swarmsim.radiation.roi_lines import Lines, RoiRates, packed_lines, roi_rates_and_slopes
 from swarmsim.scalars import over_vehicles
 from swarmsim.site.rays import Crossed, stretched
 

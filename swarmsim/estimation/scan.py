@@ -16,7 +16,7 @@ from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, l
 from swarmsim.pytree import on_device, pytree
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.ground import basis
-from swarmsim.radiation.rate import roi_rates_and_slopes
+from swarmsim.radiation.roi_lines import roi_rates_and_slopes
 from swarmsim.site.rays import Crossed, wide
 
 NODES_M = (3.0, 10.0, 30.0, 100.0)

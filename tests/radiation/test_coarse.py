@@ -10,7 +10,8 @@ import pytest
 from swarmsim.radiation import Detector
 from swarmsim.radiation.coarse import coarse
 from swarmsim.radiation.detector import Source
-from swarmsim.radiation.rate import roi_rates, roi_rates_and_slopes
+from swarmsim.radiation.rate import roi_rates
+from swarmsim.radiation.roi_lines import roi_rates_and_slopes
 from swarmsim.site import Crossed
 from swarmsim.site.rays import Shape, stretched, wide
 from swarmsim.site.wall_network import COEFFICIENTS, OUTPUTS

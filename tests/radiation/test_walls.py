@@ -9,7 +9,8 @@ import pytest
 
 from swarmsim.radiation import Detector, roi_rates, spectrum_rate
 from swarmsim.radiation.detector import AIR, Source
-from swarmsim.radiation.rate import RoiRates, from_ground, line_rates, lines_of, roi_rates_and_slopes, transmission
+from swarmsim.radiation.rate import from_ground, line_rates, transmission
+from swarmsim.radiation.roi_lines import RoiRates, lines_of, roi_rates_and_slopes
 from swarmsim.radiation.walls import MOST
 from swarmsim.site import Crossed
 from swarmsim.site.rays import Shape, stretched
