@@ -5,8 +5,6 @@ the shape of the spectrum then tells a source from a background that varies from
 """
 
 from dataclasses import replace
-from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,16 +21,13 @@ from swarmsim.estimation.normal_equations import (
     linearised,
     log_likelihood,
     log_prior,
-    moved,
     normal_equations,
-    nothing_told,
     shared_equations,
     shared_prior,
-    step_of,
     stepped,
     sums_of,
 )
-from swarmsim.estimation.window_threads import own_steps_by_threads, sums_by_threads
+from swarmsim.estimation.window_threads import fitted_by_threads
 from swarmsim.pytree import pytree
 from swarmsim.site import sample
 
@@ -81,75 +76,33 @@ def settle(
         exact: whether the rates are computed again with the lengths that were fitted, and a few further steps done;
             else they are extrapolated (`lengthened`; static).
     """
-    passes = [steps, MORE_STEPS] if exact and problem.uncertain else [steps]
-    Carry = tuple[Unknowns, Rates, jax.Array, Sums | None]
+    passes, where = [steps, MORE_STEPS] if exact and problem.uncertain else [steps], ways.position_m
 
-    def pass_(number: jax.Array | int, carry: Carry) -> Carry:
-        u, _, _, sums = carry
-        begun = u.lengths
-        source = rates(problem, ways, nuclide, begun)
+    def begin(number: jax.Array | int, u: Unknowns) -> tuple[Unknowns, Rates]:
+        source = rates(problem, ways, nuclide, u.lengths)
         if fresh:
-            u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, ways.position_m, u), lambda: u)
-        at = partial(_Fit, problem, source, begun, others, ways.position_m)
-        count = jnp.array(passes)[number]
-        if not thread_by_thread():
-            return jax.lax.fori_loop(0, count, lambda _, u: at(u).stepped(), u), source, begun, None
+            u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, where, u), lambda: u)
+        return u, source
 
-        def look(done: jax.Array, carry: tuple[Unknowns, Sums | None]) -> tuple[Unknowns, Sums]:
-            sums = at(carry[0]).sums()
-            return jax.lax.cond(done < count, at(carry[0]).moved, lambda _: carry[0], sums), sums
+    if thread_by_thread():
+        return _settled(problem, ways, *fitted_by_threads(problem, others, where, begin, passes, start))
 
-        # what the windows tell is a kernel that takes long to compile: the last look is one of the same loop
-        u, sums = jax.lax.fori_loop(0, count + (number == len(passes) - 1), look, (u, sums))
-        return u, source, begun, sums
+    def step(_: int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
+        u, source = carry
+        after = stepped(problem, u, normal_equations(problem, linearised(problem, source, others, where, u), u))
+        return after, lengthened(source, after.lengths - u.lengths)
 
-    nothing = nothing_told(problem, start) if thread_by_thread() else None
+    def pass_(number: jax.Array | int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
+        return jax.lax.fori_loop(0, jnp.array(passes)[number], step, begin(number, carry[0]))
+
     # a loop, so that what a pass does is compiled once
-    u, source, begun, sums = jax.lax.fori_loop(
-        0, len(passes), pass_, (start, silent(problem), start.lengths, nothing)
-    )  # fmt: skip
-    found = _Fit(problem, source, begun, others, ways.position_m, u)
-    return _settled(problem, ways, u, found.sums() if sums is None else sums, found.source())
-
-
-class _Fit(NamedTuple):
-    """A source with rates that were computed for lengths ``begun`` [U], and all unknowns."""
-
-    problem: Problem
-    computed: Rates
-    begun: jax.Array
-    others: Others
-    where: jax.Array  # [3]
-    u: Unknowns
-
-    def source(self) -> Rates:
-        """The rates at the lengths."""
-        return lengthened(self.computed, self.u.lengths - self.begun)
-
-    def model(self) -> Linearised:
-        """The model at the unknowns."""
-        return linearised(self.problem, self.source(), self.others, self.where, self.u)
-
-    def sums(self) -> Sums:
-        """What all windows tell."""
-        if not thread_by_thread():
-            return sums_of(self.problem, self.model(), self.u)
-        change = self.u.lengths - self.begun
-        return sums_by_threads(self.problem, self.computed, change, self.others, self.where, self.u)
-
-    def stepped(self) -> Unknowns:
-        """The unknowns after a Gauss-Newton step."""
-        return stepped(self.problem, self.u, normal_equations(self.problem, self.model(), self.u))
-
-    def moved(self, sums: Sums) -> Unknowns:
-        """The same `thread_by_thread`, from the sums."""
-        step, change = step_of(*shared_equations(self.problem, sums, self.u)[0]), self.u.lengths - self.begun
-        own = own_steps_by_threads(self.problem, self.computed, change, self.others, self.where, self.u, step)
-        return moved(self.u, step, own)
+    u, source = jax.lax.fori_loop(0, len(passes), pass_, (start, silent(problem)))
+    sums = sums_of(problem, linearised(problem, source, others, where, u), u)
+    return _settled(problem, ways, u, source, sums)
 
 
 @jax.jit  # traced once for all places of a program that call it
-def _settled(problem: Problem, ways: Ways, u: Unknowns, sums: Sums, source: Rates) -> Settled:
+def _settled(problem: Problem, ways: Ways, u: Unknowns, source: Rates, sums: Sums) -> Settled:
     (information, _), (towards, pull) = shared_equations(problem, sums, u)
     height = ways.position_m[2] - sample(problem.site.terrain_m, problem.site, ways.position_m[:2])
     precise, above = height_precision(problem.height_std_m), height - problem.height_m

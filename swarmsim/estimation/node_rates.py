@@ -10,7 +10,7 @@ import numpy as np
 
 from swarmsim.estimation.nodes import Nodes, inverse_square_gain
 from swarmsim.radiation.detector import Detector, Source
-from swarmsim.radiation.roi_lines import Lines, RoiRates, packed_lines, roi_rates_and_slopes
+from swarmsim.radiation.roi_lines import Lines, RoiRates, line_shapes, packed_lines, roi_rates_and_slopes
 from swarmsim.scalars import over_vehicles
 from swarmsim.site.rays import Crossed, stretched
 
@@ -53,13 +53,11 @@ def at_nodes_by_threads(
     """
     # without what belongs to other nuclides and other things than rates
     bare = jax.tree.map(lambda _: np.zeros(1, np.float32), detectors[0])
-    tables = [packed_lines(detector) for detector in detectors]
-    shapes = tables[0][1]
+    shapes, packed = line_shapes(detectors[0]), jnp.stack([packed_lines(detector) for detector in detectors])
     needed = tuple(
         jnp.stack([jnp.asarray(x) for x in of])
         for of in zip(*((d.radius_m, d.length_m, d.near, d.surrounds) for d in detectors), strict=True)
     )
-    packed = jnp.stack([packed for packed, _ in tables])
 
     def one(
         own: tuple[Crossed, Nodes], which: jax.Array, needed: Any, packed: jax.Array, count: jax.Array,
@@ -80,7 +78,7 @@ def at_nodes_by_threads(
 
 def alike(detectors: Sequence[Detector]) -> bool:
     """Whether `at_nodes_by_threads` can take these together: of one kind, with as many lines and regions."""
-    return len({(d.kind, packed_lines(d)[1], np.shape(d.yields), np.shape(d.near)) for d in detectors}) == 1
+    return len({(d.kind, line_shapes(d), np.shape(d.yields), np.shape(d.near)) for d in detectors}) == 1
 
 
 def sums_of_rays(found: RoiRates, rays: int) -> RoiRates:

@@ -108,11 +108,9 @@ _LINES = {
 
 def lines_of(detector: Detector, nuclide: jax.Array, asked: jax.Array | bool = True) -> Lines:
     """The lines of a nuclide [] as `roi_rates_and_slopes` takes them; none unless it is ``asked`` [] for them."""
-    packed, shapes = packed_lines(detector, nuclide)
     # of many, all go on as long as any: a line without photons adds nothing, and to leave it out costs more
-    return Lines(
-        packed=packed, count=at_most(jnp.where(asked, lines_with_photons(detector, nuclide), 0)), shapes=shapes
-    )
+    count = at_most(jnp.where(asked, lines_with_photons(detector, nuclide), 0))
+    return Lines(packed=packed_lines(detector, nuclide), count=count, shapes=line_shapes(detector))
 
 
 def lines_with_photons(detector: Detector, nuclide: jax.Array) -> jax.Array:
@@ -120,19 +118,26 @@ def lines_with_photons(detector: Detector, nuclide: jax.Array) -> jax.Array:
     return jnp.max(jnp.where(detector.yields[nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
 
 
-def packed_lines(
-    detector: Detector, nuclide: jax.Array | None = None
-) -> tuple[jax.Array, tuple[tuple[str, tuple[int, ...]], ...]]:
-    """Tables of all lines [N, L, entries], or of a nuclide's [L, entries]; and the shapes of `Lines`."""
-    rows, shapes = [], []
+Shapes = tuple[tuple[str, tuple[int, ...]], ...]
+
+
+def line_shapes(detector: Detector) -> Shapes:
+    """Name and shape of each table that `Lines` cuts a row up into."""
+    found = []
+    for name, axis in _LINES.items():
+        own = np.delete(np.shape(getattr(detector, name)), [0, 1 + axis]).tolist()
+        found.append((name, (1, *own[:axis], 1, *own[axis:])))
+    return tuple(found)
+
+
+def packed_lines(detector: Detector, nuclide: jax.Array | None = None) -> jax.Array:
+    """Tables of all lines, a row for each [N, L, entries]; or those of a ``nuclide`` [] alone [L, entries]."""
+    rows, lead = [], 1 if nuclide is None else 0
     for name, axis in _LINES.items():
         table = jnp.asarray(getattr(detector, name))
-        lead = 1 if nuclide is None else 0
         row = jnp.moveaxis(table if nuclide is None else table[nuclide], lead + axis, lead)
-        front, own = row.shape[: lead + 1], row.shape[lead + 1 :]
-        rows.append(row.reshape(*front, -1))
-        shapes.append((name, (1, *own[:axis], 1, *own[axis:])))
-    return jnp.concatenate(rows, axis=-1), tuple(shapes)
+        rows.append(row.reshape(*row.shape[: lead + 1], -1))
+    return jnp.concatenate(rows, axis=-1)
 
 
 def _of_line(
