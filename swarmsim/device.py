@@ -17,8 +17,6 @@ Out = TypeVar("Out")
 AT_A_TIME = 64  # missions for which an accelerator computes what only some of them need: each is much by itself
 IN_STEP = 512  # missions that wait for one another, where what takes long is asked for inside, by `for_those` again
 
-WINDOW_THREADS = False  # whether an accelerator estimates sources `thread_by_thread`: not yet measured on one
-
 _ASKED: ContextVar[jax.Array | None] = ContextVar("swarmsim asked", default=None)
 _CORES: ContextVar[str | None] = ContextVar("swarmsim cores", default=None)
 
@@ -29,14 +27,6 @@ def on_processor() -> bool:
     An accelerator wants as much as possible at a time.
     """
     return jax.default_backend() == "cpu"
-
-
-def thread_by_thread() -> bool:
-    """Whether all that an estimate computes of a ray or a window is that of one thread of an accelerator.
-
-    Else XLA makes kernels of it, between which everything passes through memory.
-    """
-    return WINDOW_THREADS and not on_processor()
 
 
 @contextmanager

@@ -9,25 +9,19 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import thread_by_thread
 from swarmsim.estimation.forward import Problem, Rates, Ways, lengthened, rates, silent, variance_of
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.estimation.normal_equations import (
     MEAN_FLOOR,
     Linearised,
     Others,
-    Sums,
     Unknowns,
     linearised,
     log_likelihood,
     log_prior,
     normal_equations,
-    shared_equations,
-    shared_prior,
     stepped,
-    sums_of,
 )
-from swarmsim.estimation.window_threads import fitted_by_threads
 from swarmsim.pytree import pytree
 from swarmsim.site import sample
 
@@ -76,52 +70,49 @@ def settle(
         exact: whether the rates are computed again with the lengths that were fitted, and a few further steps done;
             else they are extrapolated (`lengthened`; static).
     """
-    passes, where = [steps, MORE_STEPS] if exact and problem.uncertain else [steps], ways.position_m
+    passes = [steps, MORE_STEPS] if exact and problem.uncertain else [steps]
 
-    def begin(number: jax.Array | int, u: Unknowns) -> tuple[Unknowns, Rates]:
-        source = rates(problem, ways, nuclide, u.lengths)
-        if fresh:
-            u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, where, u), lambda: u)
-        return u, source
-
-    if thread_by_thread():
-        return _settled(problem, ways, *fitted_by_threads(problem, others, where, begin, passes, start))
+    def linear(u: Unknowns, source: Rates) -> Linearised:
+        return linearised(problem, source, others, ways.position_m, u)
 
     def step(_: int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
         u, source = carry
-        after = stepped(problem, u, normal_equations(problem, linearised(problem, source, others, where, u), u))
-        return after, lengthened(source, after.lengths - u.lengths)
+        moved = stepped(problem, u, normal_equations(problem, linear(u, source), u))
+        return moved, lengthened(source, moved.lengths - u.lengths)
 
     def pass_(number: jax.Array | int, carry: tuple[Unknowns, Rates]) -> tuple[Unknowns, Rates]:
-        return jax.lax.fori_loop(0, jnp.array(passes)[number], step, begin(number, carry[0]))
+        u, _ = carry
+        source = rates(problem, ways, nuclide, u.lengths)
+        if fresh:
+            u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, ways.position_m, u), lambda: u)
+        return jax.lax.fori_loop(0, jnp.array(passes)[number], step, (u, source))
 
     # a loop, so that what a pass does is compiled once
     u, source = jax.lax.fori_loop(0, len(passes), pass_, (start, silent(problem)))
-    sums = sums_of(problem, linearised(problem, source, others, where, u), u)
-    return _settled(problem, ways, u, source, sums)
+    return _settled(problem, linear(u, source), u, ways, source)
 
 
 @jax.jit  # traced once for all places of a program that call it
-def _settled(problem: Problem, ways: Ways, u: Unknowns, source: Rates, sums: Sums) -> Settled:
-    (information, _), (towards, pull) = shared_equations(problem, sums, u)
+def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, source: Rates) -> Settled:
+    at = normal_equations(problem, model, u)
     height = ways.position_m[2] - sample(problem.site.terrain_m, problem.site, ways.position_m[:2])
     precise, above = height_precision(problem.height_std_m), height - problem.height_m
-    likelihood = sums.likelihood + sums.prior + shared_prior(problem, u) - 0.5 * precise * jnp.square(above)
-    precisely = towards.at[2, 2].add(precise)
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(information), 1e-20))
-    unit = information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
+    likelihood = log_likelihood(problem, model) + log_prior(problem, model, u) - 0.5 * precise * jnp.square(above)
+    towards, pull = at.towards.at[2, 2].add(precise), at.pull.at[2].add(-precise * above)
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(at.information), 1e-20))
+    unit = at.information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
     root = jax.scipy.linalg.cholesky(unit, lower=True)
     log_volume = -jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(scale))
     # where nothing is left of an activity its logarithm says nothing
     excess = (jnp.log(jnp.maximum(u.activity_bq, 1.0)) - problem.log_activity) / problem.log_activity_std
-    value = likelihood + log_volume + sums.log_volume - 0.5 * jnp.square(excess)
+    value = likelihood + log_volume + at.log_volume - 0.5 * jnp.square(excess)
     return Settled(
         value=jnp.where(jnp.isfinite(value), value, -jnp.inf),
         likelihood=jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf),
         unknowns=u,
-        covariance=scaled_inverse(information),
-        towards=towards,
-        move=scaled_inverse(precisely + jnp.eye(3) * FLAT) @ pull.at[2].add(-precise * above),
+        covariance=scaled_inverse(at.information),
+        towards=at.towards,
+        move=scaled_inverse(towards + jnp.eye(3) * FLAT) @ pull,
         rates=source,
     )
 

@@ -10,17 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.device import at_most, thread_by_thread
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.measurements import Measurements
-from swarmsim.estimation.node_rates import alike, at_nodes, at_nodes_by_threads, sums_of_rays
-from swarmsim.estimation.nodes import Nodes, Span, nodes_of
+from swarmsim.estimation.nodes import Nodes, Span, inverse_square_gain, nodes_of
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.rate import share_registered
-from swarmsim.radiation.roi_lines import RoiRates, lines_of, lines_with_photons
+from swarmsim.radiation.roi_lines import roi_rates_and_slopes
 from swarmsim.site import Site
-from swarmsim.site.rays import Crossed, crossed_from
+from swarmsim.site.rays import Crossed, crossed_from, stretched
 
 EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
 
@@ -88,12 +86,9 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array, 
     factors = jnp.ones(materials).at[jnp.array(problem.uncertain, jnp.int32)].set(jnp.exp(lengths))
     source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
     by = problem.uncertain if slopes else ()
-    valid = problem.measurements.valid
-    asked = [jnp.any(valid[first:last]) for first, last, _, _ in problem.spans]
-    found = _at_all_nodes(problem, ways.crossed, asked, source, factors, by)
     parts = [
-        _of_windows(problem, span, nodes, source, own)
-        for span, nodes, own in zip(problem.spans, _by_span(problem, problem.nodes), found, strict=True)
+        _of_windows(problem, span, nodes, crossed, source, factors, by)
+        for span, (nodes, crossed) in zip(problem.spans, _by_span(problem, (problem.nodes, ways.crossed)), strict=True)
     ]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
@@ -104,44 +99,34 @@ def _by_span(problem: Problem, x: Any) -> list[Any]:
     return [jax.tree.map(lambda x, part=slice(*part): x[part], x) for part in itertools.pairwise([0, *ends])]
 
 
-def _at_all_nodes(
+def _of_windows(
     problem: Problem,
+    span: Span,
+    nodes: Nodes,
     crossed: Crossed,
-    asked: Sequence[jax.Array],
     source: Source,
     factors: jax.Array,
     by: tuple[int, ...],
-) -> list[RoiRates]:
-    """Rates of the windows of each span that is ``asked`` [] for; of the others they mean nothing."""
-    detectors, rays = [problem.detectors[number] for _, _, number, _ in problem.spans], [s[3] for s in problem.spans]
-    parts = list(zip(_by_span(problem, crossed), _by_span(problem, problem.nodes), strict=True))
-    if not thread_by_thread():
-        return [
-            at_nodes(*part, d, lines_of(d, source.nuclide, of), source, factors, by=by, places=places)
-            for part, d, of, places in zip(parts, detectors, asked, rays, strict=True)
-        ]
-    together = partial(at_nodes_by_threads, source=source, factors=factors, by=by)
-    counts = [jnp.where(of, lines_with_photons(d, source.nuclide), 0) for d, of in zip(detectors, asked, strict=True)]
-    if alike(detectors):
-        which = np.concatenate([np.full((last - first) * n, k) for k, (first, last, _, n) in enumerate(problem.spans)])
-        count = at_most(jnp.max(jnp.stack(counts)))
-        every = _by_span(problem, together(crossed, problem.nodes, which, detectors, count))
-    else:
-        every = [
-            together(*part, np.zeros(part[1].axis.shape[0]), [d], at_most(count))
-            for part, d, count in zip(parts, detectors, counts, strict=True)
-        ]
-    return [sums_of_rays(found, places) for found, places in zip(every, rays, strict=True)]
-
-
-def _of_windows(problem: Problem, span: Span, nodes: Nodes, source: Source, found: RoiRates) -> Rates:
-    first, last, _, rays = span
-    exposure, offset = problem.measurements.exposure_s[first:last], nodes.position_m - source.position_m
+) -> Rates:
+    """The rates of a span's windows; those of spans without a valid one mean nothing."""
+    (first, last, number, rays), m = span, problem.measurements
+    offset = nodes.position_m - source.position_m
+    found = roi_rates_and_slopes(
+        problem.detectors[number],
+        source,
+        stretched(crossed, factors),
+        nodes.position_m,
+        nodes.axis,
+        by,
+        weight=inverse_square_gain(offset, nodes),
+        places=rays,
+        asked=jnp.any(m.valid[first:last]),
+    )
     strength, share = found.net * jnp.sum(offset * offset, axis=1), jnp.sum(nodes.pieces, axis=1)
     strength, share = strength.reshape(-1, rays), share.reshape(-1, rays)
     mean = jnp.sum(share * strength, axis=1)
     spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)
-    regions = problem.background.shape[1]
+    exposure, regions = m.exposure_s[first:last], problem.background.shape[1]
     return Rates(
         counts=padded(found.rates, regions) * exposure[:, None],
         slopes=padded(found.slopes, regions) * exposure[:, None, None],

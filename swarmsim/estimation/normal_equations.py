@@ -55,7 +55,7 @@ def nothing_known(problem: Problem, sources: int) -> Unknowns:
     return Unknowns(
         activity_bq=jnp.zeros(()),
         others=jnp.ones(sources),
-        level=jnp.zeros(problem.detector.shape[1]),
+        level=jnp.zeros(len(problem.detectors)),
         lengths=jnp.zeros(problem.material_std.shape[0]),
         background=jnp.zeros(n),
         gain=jnp.zeros(n),
@@ -138,7 +138,7 @@ def _own_precision(problem: Problem, variance: jax.Array, u: Unknowns) -> jax.Ar
 
 def prior_precision(problem: Problem, sources: int) -> jax.Array:
     """Precisions [P] of the unknowns that windows share."""
-    loose = jnp.full(1 + sources + problem.detector.shape[1], LOOSE)
+    loose = jnp.full(1 + sources + len(problem.detectors), LOOSE)
     lengths = 1.0 / jnp.square(jnp.maximum(problem.material_std, 1e-3))
     return jnp.concatenate([loose, lengths])
 
@@ -163,18 +163,6 @@ class NormalEquations:
     log_volume: jax.Array  # [] of the windows' own unknowns, over that of their priors
     precision: jax.Array  # [2, n] of the priors of a window's own unknowns, there
     fitted: jax.Array  # [] how many of them the data determine
-
-
-@pytree
-class Sums:
-    """What all windows tell of the unknowns that they share (P) and of the place, their own ones eliminated."""
-
-    whole: jax.Array  # [P + 3, P + 3] information, without priors of what they share
-    push: jax.Array  # [P + 3]
-    log_volume: jax.Array  # [] of the windows' own unknowns, over that of their priors
-    fitted: jax.Array  # [] how many of those the data determine
-    likelihood: jax.Array  # [] its logarithm, relative to the saturated model
-    prior: jax.Array  # [] logarithm of that of the windows' own unknowns
 
 
 @pytree
@@ -217,65 +205,30 @@ def _eliminated(problem: Problem, model: Linearised, u: Unknowns) -> _Eliminated
 @jax.jit  # traced once for all places of a program that call it
 def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> NormalEquations:
     """The normal equations at ``u``, where ``model`` is linearised."""
+    m, k = problem.measurements, u.others.shape[0]
     e = _eliminated(problem, model, u)
-    sums = _sums(problem, model, u, e)
-    shared, of_place = shared_equations(problem, sums, u)
+    column, factor = _unknowns(problem, model, k)
+    whole = jnp.sum(e.products[column][:, column] * factor[:, None] * factor, axis=-1)
+    push = jnp.sum(e.pushes[column] * factor, axis=-1)
+    common_precision = prior_precision(problem, k)
+    p = common_precision.shape[0]
+    information = whole[:p, :p] + jnp.diag(common_precision)
+    across = whole[:p, p:]
+    common_push = push[:p] - common_precision * _common(u)
+    inverse = scaled_inverse(information)
+    told = e.own[0, 0] * e.precision[0] + e.own[1, 1] * e.precision[1]
     return NormalEquations(
-        information=shared[0],
-        push=shared[1],
+        information=information,
+        push=common_push,
         own=e.own,
         crossing=e.crossing,
         own_push=e.own_push,
-        towards=of_place[0],
-        pull=of_place[1],
-        log_volume=sums.log_volume,
+        towards=whole[p:, p:] - across.T @ inverse @ across,
+        pull=push[p:] - across.T @ inverse @ common_push,
+        log_volume=-0.5 * jnp.sum(jnp.where(m.valid, jnp.log(e.determinant * jnp.prod(model.variance, axis=0)), 0.0)),
         precision=e.precision,
-        fitted=sums.fitted,
+        fitted=jnp.sum(jnp.where(m.valid, 2.0 - told, 0.0)),
     )
-
-
-def nothing_told(problem: Problem, u: Unknowns) -> Sums:
-    """That of no windows."""
-    zero, size = jnp.zeros(()), prior_precision(problem, u.others.shape[0]).shape[0] + 3
-    return Sums(
-        whole=jnp.zeros((size, size)), push=jnp.zeros(size), log_volume=zero, fitted=zero, likelihood=zero, prior=zero
-    )  # fmt: skip
-
-
-def sums_of(problem: Problem, model: Linearised, u: Unknowns) -> Sums:
-    """What the windows of ``problem`` tell at ``u``, where ``model`` is linearised."""
-    return _sums(problem, model, u, _eliminated(problem, model, u))
-
-
-def _sums(problem: Problem, model: Linearised, u: Unknowns, e: _Eliminated) -> Sums:
-    valid = problem.measurements.valid
-    column, factor = _unknowns(problem, model, u.others.shape[0])
-    told = e.own[0, 0] * e.precision[0] + e.own[1, 1] * e.precision[1]
-    return Sums(
-        whole=jnp.sum(e.products[column][:, column] * factor[:, None] * factor, axis=-1),
-        push=jnp.sum(e.pushes[column] * factor, axis=-1),
-        log_volume=-0.5 * jnp.sum(jnp.where(valid, jnp.log(e.determinant * jnp.prod(model.variance, axis=0)), 0.0)),
-        fitted=jnp.sum(jnp.where(valid, 2.0 - told, 0.0)),
-        likelihood=log_likelihood(problem, model),
-        prior=_own_prior(problem, model, u),
-    )
-
-
-def shared_equations(
-    problem: Problem, sums: Sums, u: Unknowns
-) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:  # fmt: skip
-    """Information [P, P] and push [P] of what windows share at ``u``, and those of the place [3, 3], [3].
-
-    The former with their priors, the latter with the former marginalised.
-    """
-    common_precision = prior_precision(problem, u.others.shape[0])
-    p = common_precision.shape[0]
-    information = sums.whole[:p, :p] + jnp.diag(common_precision)
-    across = sums.whole[:p, p:]
-    push = sums.push[:p] - common_precision * _common(u)
-    inverse = scaled_inverse(information)
-    towards = sums.whole[p:, p:] - across.T @ inverse @ across
-    return (information, push), (towards, sums.push[p:] - across.T @ inverse @ push)
 
 
 @jax.jit
@@ -287,7 +240,7 @@ def joint_equations(
     Places are in the world. The levels are eliminated; as if nothing were in the way. ``model`` has no source but the K
     others.
     """
-    count, levels = u.others.shape[0], problem.detector.shape[1]
+    count, levels = u.others.shape[0], len(problem.detectors)
     e = _eliminated(problem, model, u)
     offset = places_m[:, None] - problem.measurements.position_m
     squared = jnp.maximum(jnp.sum(offset * offset, axis=-1, keepdims=True), 0.01)
@@ -304,16 +257,16 @@ def joint_equations(
 def _products(one: jax.Array, other: jax.Array) -> jax.Array:
     """Sums over the regions [A, B, n] of products of [A, R, n] and [B, R, n].
 
-    The regions are few, and a sum that is written out is computed for several windows at a time, or by one thread.
+    The regions are few, and a sum that is written out is computed for several windows at a time.
     """
-    if on_processor() or one.shape[-1] == 1:
+    if on_processor():
         return functools.reduce(jnp.add, (one[:, None, r] * other[:, r] for r in range(one.shape[1])))
     return jnp.sum(one[:, None] * other, axis=2)
 
 
 def _unknowns(problem: Problem, model: Linearised, sources: int) -> tuple[np.ndarray, jax.Array]:
     """The column of each of the P unknowns that windows share and of the 3 of the place; its factor [P + 3, n]."""
-    levels, last = problem.detector.shape[1], model.columns.shape[0]
+    levels, last = len(problem.detectors), model.columns.shape[0]
     background = 1 + sources
     column = [*range(background), *[background] * levels, *range(background + 1, last), 0, 0, 0]
     ones = jnp.ones((1, model.nearer.shape[1]))
@@ -323,36 +276,17 @@ def _unknowns(problem: Problem, model: Linearised, sources: int) -> tuple[np.nda
 
 def stepped(problem: Problem, u: Unknowns, at: NormalEquations) -> Unknowns:
     """The unknowns after a Gauss-Newton step."""
-    step = step_of(at.information, at.push)
-    return moved(u, step, _own_step(problem, at, step, u.others.shape[0]))
-
-
-def step_of(information: jax.Array, push: jax.Array) -> jax.Array:
-    """The step [P] of what windows share."""
-    return jnp.clip(scaled_inverse(information) @ push, -LONGEST_STEP, LONGEST_STEP)
-
-
-def own_step(problem: Problem, model: Linearised, u: Unknowns, step: jax.Array) -> jax.Array:
-    """Steps [2, n] of the windows' own unknowns at ``u``, where ``model`` is linearised, by that of what they share."""
-    return _own_step(problem, _eliminated(problem, model, u), step, u.others.shape[0])
-
-
-def _own_step(problem: Problem, at: "NormalEquations | _Eliminated", step: jax.Array, sources: int) -> jax.Array:
-    of_sources, levels, lengths = jnp.split(step, [1 + sources, 1 + sources + problem.detector.shape[1]])
-    background = levels @ problem.detector.T
-    taken = (
-        jnp.einsum("abn,b->an", at.crossing[:, : 1 + sources], of_sources)
-        + at.crossing[:, 1 + sources] * background
-        + jnp.einsum("abn,b->an", at.crossing[:, 2 + sources :], lengths)
-    )
-    rest = at.own_push - taken
-    return jnp.clip(at.own[:, 0] * rest[0] + at.own[:, 1] * rest[1], -LONGEST_STEP, LONGEST_STEP)
-
-
-def moved(u: Unknowns, step: jax.Array, own: jax.Array) -> Unknowns:
-    """The unknowns after a step [P] of what windows share, and those [2, n] of their own ones."""
+    step = jnp.clip(scaled_inverse(at.information) @ at.push, -LONGEST_STEP, LONGEST_STEP)
     k, d = u.others.shape[0], u.level.shape[0]
     sources, levels, lengths = jnp.split(step, [1 + k, 1 + k + d])
+    background = levels @ problem.detector.T
+    taken = (
+        jnp.einsum("abn,b->an", at.crossing[:, : 1 + k], sources)
+        + at.crossing[:, 1 + k] * background
+        + jnp.einsum("abn,b->an", at.crossing[:, 2 + k :], lengths)
+    )
+    rest = at.own_push - taken
+    own = jnp.clip(at.own[:, 0] * rest[0] + at.own[:, 1] * rest[1], -LONGEST_STEP, LONGEST_STEP)
     return Unknowns(
         activity_bq=u.activity_bq * jnp.maximum(1.0 + sources[0], LOWEST_SHARE),
         others=jnp.clip(u.others * jnp.maximum(1.0 + sources[1:], LOWEST_SHARE), 1e-3, 1e3),
@@ -379,15 +313,7 @@ def window_unknowns(u: Unknowns) -> jax.Array:
 
 def log_prior(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
     """Log prior [] of the unknowns but the place, up to a constant."""
-    return shared_prior(problem, u) + _own_prior(problem, model, u)
-
-
-def shared_prior(problem: Problem, u: Unknowns) -> jax.Array:
-    """Log prior [] of the unknowns that windows share, up to a constant."""
-    return -0.5 * jnp.sum(prior_precision(problem, u.others.shape[0]) * jnp.square(_common(u)))
-
-
-def _own_prior(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
+    shared = prior_precision(problem, u.others.shape[0]) * jnp.square(_common(u))
     relative = jnp.square(window_unknowns(u)) / model.variance
     own = relative[0] + (problem.tail + 1.0) * jnp.log1p(relative[1] / problem.tail)
-    return -0.5 * jnp.sum(jnp.where(problem.measurements.valid, own, 0.0))
+    return -0.5 * (jnp.sum(shared) + jnp.sum(jnp.where(problem.measurements.valid, own, 0.0)))

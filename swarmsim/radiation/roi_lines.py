@@ -12,8 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.device import at_most, on_processor, thread_by_thread
-from swarmsim.pytree import pytree, static
+from swarmsim.device import at_most, on_processor
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.lines import SPECTRUM_DEPTHS
 from swarmsim.radiation.rate import ground_and_slope, scattered_on, unattenuated
@@ -21,23 +20,6 @@ from swarmsim.site.rays import Crossed
 
 LINES_TOGETHER = 2
 """Of a nuclide, which an accelerator computes at a time."""
-
-
-@pytree
-class Lines:
-    """The lines of one nuclide: what of a detector's tables is theirs."""
-
-    packed: jax.Array  # [L, entries] a row for each: then a thread of an accelerator reads the entries of one alone
-    count: jax.Array  # [] int32 of those that have photons
-    shapes: tuple[tuple[str, tuple[int, ...]], ...] = static()  # of each table, of one line of one nuclide
-
-    def tables(self, row: jax.Array) -> dict[str, Any]:
-        """The tables of the line of a row, as if it were the only one of the only nuclide."""
-        found, first = {}, 0
-        for name, shape in self.shapes:
-            last = first + int(np.prod(shape))
-            found[name], first = row[first:last].reshape(shape), last
-        return found
 
 
 class RoiRates(NamedTuple):
@@ -57,7 +39,7 @@ def roi_rates_and_slopes(
     by: tuple[int, ...] = (),
     weight: jax.Array | None = None,
     places: int = 1,
-    lines: Lines | None = None,
+    asked: jax.Array | bool = True,
 ) -> RoiRates:
     """`roi_rates` with their derivatives at n places, or sums of them over some places at a time.
 
@@ -72,31 +54,35 @@ def roi_rates_and_slopes(
         by: numbers of U materials (static).
         weight: [n] of the places in the sums; 1 by default.
         places: in a sum, neighbours (static).
-        lines: of the source's nuclide, if they are known already (`lines_of`).
+        asked: [] bool; where it is False rates mean nothing, and cost next to nothing if none of a batch are asked for.
     """
     given = jnp.ones(axis.shape[0]) if weight is None else weight
-    own = lines_of(detector, source.nuclide) if lines is None else lines
-    one = replace(source, nuclide=jnp.int32(0))
-    n, regions = axis.shape[0], dict(own.shapes)["peak_rois"][-1]
-    m = n // places
+    lines, one = _lines_of(detector, source.nuclide), replace(source, nuclide=jnp.int32(0))
+    n, regions = axis.shape[0], detector.peak_rois.shape[-1]
+    m, together = n // places, 1 if on_processor() else LINES_TOGETHER
     nothing = RoiRates(jnp.zeros((m, regions)), jnp.zeros((m, len(by), regions)), jnp.zeros(n))
+    # most nuclides have fewer lines than the tables have rows
+    count = jnp.max(jnp.where(detector.yields[source.nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
+    # of many, all go on as long as any: a line without photons adds nothing, and to leave it out costs more
+    count = at_most(-(-jnp.where(asked, count, 0) // together))
 
-    def of(row: jax.Array) -> RoiRates:
-        return _of_line(replace(detector, **own.tables(row)), one, way, position_m, axis, by, given, places)
-
-    together = 1 if on_processor() or thread_by_thread() else LINES_TOGETHER
-    if together == 1:
-        return jax.lax.fori_loop(
-            0, own.count, lambda number, sums: jax.tree.map(jnp.add, sums, of(own.packed[number])), nothing
-        )
-    # a line without photons adds nothing
-    rows = jnp.pad(own.packed, [(0, -own.packed.shape[0] % together), (0, 0)])
+    def of(line: dict[str, jax.Array]) -> RoiRates:
+        own: Any = line
+        return _of_line(replace(detector, **own), one, way, position_m, axis, by, given, places)
 
     def add(number: jax.Array, sums: RoiRates) -> RoiRates:
-        some = jax.vmap(of)(jax.lax.dynamic_slice_in_dim(rows, number * together, together))
-        return jax.tree.map(lambda old, new: old + jnp.sum(new, axis=0), sums, some)
+        if together == 1:
+            return jax.tree.map(jnp.add, sums, of({name: x[number] for name, x in lines.items()}))
+        own = {name: _rows(x, number * together, together) for name, x in lines.items()}
+        return jax.tree.map(lambda old, new: old + jnp.sum(new, axis=0), sums, jax.vmap(of)(own))
 
-    return jax.lax.fori_loop(0, -(-own.count // together), add, nothing)
+    return jax.lax.fori_loop(0, count, add, nothing)
+
+
+def _rows(x: jax.Array, first: jax.Array, count: int) -> jax.Array:
+    """Rows [count, ...] from the ``first`` on; zeros beyond the last one."""
+    padded = jnp.pad(x, [(0, -x.shape[0] % count)] + [(0, 0)] * (x.ndim - 1))
+    return jax.lax.dynamic_slice_in_dim(padded, first, count)
 
 
 _LINES = {
@@ -106,38 +92,10 @@ _LINES = {
 """Tables that rates by region take from a detector, and the axis of the lines in those of a nuclide."""
 
 
-def lines_of(detector: Detector, nuclide: jax.Array, asked: jax.Array | bool = True) -> Lines:
-    """The lines of a nuclide [] as `roi_rates_and_slopes` takes them; none unless it is ``asked`` [] for them."""
-    # of many, all go on as long as any: a line without photons adds nothing, and to leave it out costs more
-    count = at_most(jnp.where(asked, lines_with_photons(detector, nuclide), 0))
-    return Lines(packed=packed_lines(detector, nuclide), count=count, shapes=line_shapes(detector))
-
-
-def lines_with_photons(detector: Detector, nuclide: jax.Array) -> jax.Array:
-    """Number [] of lines of a nuclide []: most have fewer than the tables have rows."""
-    return jnp.max(jnp.where(detector.yields[nuclide] > 0.0, jnp.arange(1, detector.yields.shape[1] + 1), 0))
-
-
-Shapes = tuple[tuple[str, tuple[int, ...]], ...]
-
-
-def line_shapes(detector: Detector) -> Shapes:
-    """Name and shape of each table that `Lines` cuts a row up into."""
-    found = []
-    for name, axis in _LINES.items():
-        own = np.delete(np.shape(getattr(detector, name)), [0, 1 + axis]).tolist()
-        found.append((name, (1, *own[:axis], 1, *own[axis:])))
-    return tuple(found)
-
-
-def packed_lines(detector: Detector, nuclide: jax.Array | None = None) -> jax.Array:
-    """Tables of all lines, a row for each [N, L, entries]; or those of a ``nuclide`` [] alone [L, entries]."""
-    rows, lead = [], 1 if nuclide is None else 0
-    for name, axis in _LINES.items():
-        table = jnp.asarray(getattr(detector, name))
-        row = jnp.moveaxis(table if nuclide is None else table[nuclide], lead + axis, lead)
-        rows.append(row.reshape(*row.shape[: lead + 1], -1))
-    return jnp.concatenate(rows, axis=-1)
+def _lines_of(detector: Detector, nuclide: jax.Array) -> dict[str, jax.Array]:
+    """Those tables of each line [L, 1, ...], as if it were the only one of the only nuclide."""
+    of = {name: jnp.moveaxis(jnp.asarray(getattr(detector, name))[nuclide], axis, 0) for name, axis in _LINES.items()}
+    return {name: jnp.expand_dims(of[name], (1, 2 + axis)) for name, axis in _LINES.items()}
 
 
 def _of_line(

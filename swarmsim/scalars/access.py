@@ -8,7 +8,6 @@ loops of one pass, whose operations are the accesses and the sums that make thei
 outside, because operations that have a constant in common are tied by it.
 """
 
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,9 +19,6 @@ from jax import lax
 
 from swarmsim.scalars.graph import Graph, Node, Scalar, is_constant, unbound
 
-TOGETHER = 32
-"""Entries that a kernel of many of them reads together: more would wait in registers until they are used."""
-
 
 @dataclass(frozen=True)
 class Rows:
@@ -31,7 +27,6 @@ class Rows:
     of_vehicle: bool
     of_mission: bool
     entries: int  # of one vehicle
-    stride: int = 1  # from one of them to the next: the number of vehicles where these stand side by side
 
     @property
     def shared(self) -> bool:
@@ -43,7 +38,7 @@ class Rows:
 
         A mission has ``size`` vehicles.
         """
-        entries = np.int32(1 if self.stride > 1 else self.entries)
+        entries = np.int32(self.entries)
         if self.of_vehicle and self.of_mission:
             return vehicle * entries
         if self.of_vehicle:
@@ -79,15 +74,14 @@ class Memory:
 
 @dataclass
 class MemoryGraph(Graph):
-    """A graph in which entries are read from memory, several together."""
+    """A graph in which entries are read from memory, as many as possible together."""
 
     memory: Memory = field(kw_only=True)
-    together: int | None = None  # in the order in which they are used; as many as possible if there is no limit
     _reads: dict[Any, Read] = field(default_factory=dict)
 
     def inner(self) -> "MemoryGraph":
         """Empty graph for the trace of a loop's or a branch's body."""
-        return MemoryGraph(self.size, self.varying, self.stores, memory=self.memory, together=self.together)
+        return MemoryGraph(self.size, self.varying, self.stores, memory=self.memory)
 
     def read(self, ref: Any, rows: Rows, offset: Scalar, place: int) -> Read:
         """The entry at ``offset + place``."""
@@ -97,42 +91,21 @@ class MemoryGraph(Graph):
     def values(self, scalars: Any) -> list[Any]:
         """Value of each scalar; binds what has not been bound yet."""
         scalars = list(scalars)
-        if self.together is None:
-            for reads in _rounds(unbound(x for x in scalars if isinstance(x, Node) and x.value is None)):
-                super().values(read.offset for read in reads if read.offset is not None)
-                for read, value in zip(reads, self._read(reads), strict=True):
-                    read.value = value
-            return super().values(scalars)
-        return self._in_order(scalars, self.together)
-
-    def _in_order(self, scalars: list[Any], together: int) -> list[Any]:
-        order = unbound(x for x in scalars if isinstance(x, Node) and x.value is None)
-        free, reads = _free(order), [x for x in order if isinstance(x, Read)]
-        for node in order:
-            if isinstance(node, Read) and node.value is None:
-                wanted = (read for read in reads if read.value is None and (read is node or read in free))
-                some = list(itertools.islice(wanted, together))
-                reads = [read for read in reads if read.value is None]
-                super().values(read.offset for read in some if read.offset is not None)
-                for read, value in zip(some, self._read(some), strict=True):
-                    read.value = value
-            else:
-                super().values([node])
-        return [x.value if isinstance(x, Node) else x for x in scalars]
+        for reads in _rounds(unbound(x for x in scalars if isinstance(x, Node) and x.value is None)):
+            super().values(read.offset for read in reads if read.offset is not None)
+            for read, value in zip(reads, self._read(reads), strict=True):
+                read.value = value
+        return super().values(scalars)
 
     def _read(self, reads: Sequence[Read]) -> list[Any]:
         memory = self.memory
         firsts = {read.rows: read.rows.first(memory.size, memory.vehicle) for read in reads}
         firsts = {rows: first for rows, first in firsts.items() if first is not None}
-        far = {(r.offset, r.rows.stride): r.offset.value for r in reads if r.offset is not None}
-        offsets = {(of, stride): x if stride == 1 else x * np.int32(stride) for (of, stride), x in far.items()}
+        offsets = {read.offset: read.offset.value for read in reads if read.offset is not None}
 
         def work(number: "Numbers", given: Sequence[Any]) -> list[Any]:
             known: dict[Any, Any] = dict(zip([*firsts, *offsets], given, strict=True))
-            return [
-                r.ref[number.after(r.place * r.rows.stride, known.get(r.rows), known.get((r.offset, r.rows.stride)))]
-                for r in reads
-            ]
+            return [r.ref[number.after(r.place, known.get(r.rows), known.get(r.offset))] for r in reads]
 
         blank = [jnp.zeros((self.size,) if read.mapped else (), read.ref.dtype) for read in reads]
         return apart(work, [*firsts.values(), *offsets.values()], blank)
@@ -149,17 +122,6 @@ def _rounds(order: Sequence[Node]) -> Iterator[list[Read]]:
             found += [[] for _ in range(len(found), number + 1)]
             found[number].append(node)
     yield from found
-
-
-def _free(order: Sequence[Node]) -> set[Node]:
-    """The nodes that depend on no read but themselves, of some of which each comes after its operands."""
-    free: set[Node] = set()
-    inner = set(order)
-    for node in order:
-        before = [x for x in node.operands if isinstance(x, Node) and x in inner]
-        if all(x in free and not isinstance(x, Read) for x in before):
-            free.add(node)
-    return free
 
 
 class Numbers:

@@ -12,6 +12,7 @@ from jax.extend import core
 
 from swarmsim.scalars.interpreter import (
     CALLS,
+    SMALL,
     Interpreter,
     Value,
     Whole,
@@ -108,7 +109,7 @@ def _scan(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[
 
 def _history(interpreter: Interpreter, queue: list[Any], full: Any, aval: Any, mapped: bool) -> Value:
     """Value of what a loop put out, from its dumped arrays with the loop's axis in front."""
-    if is_small(aval, interpreter.small):
+    if is_small(aval, SMALL):
         parts = [queue.pop(0) for _ in range(aval.size)]
         array = jnp.stack(parts, -1) if parts else jnp.zeros((full.shape[0], 0), aval.dtype)
         array = array.reshape(*array.shape[: 1 + mapped], *aval.shape)
@@ -140,7 +141,7 @@ def _row(interpreter: Interpreter, value: Value, number: int, aval: Any) -> Valu
         entry = lax.index_in_dim(value.array, number, int(value.mapped), keepdims=False)
         return interpreter.take_apart(entry, value.mapped, aval)
     row = value[number, ...]
-    if is_small(aval, interpreter.small):
+    if is_small(aval, SMALL):
         return tidy(row, aval.dtype)
     return row
 
@@ -148,7 +149,7 @@ def _row(interpreter: Interpreter, value: Value, number: int, aval: Any) -> Valu
 def _joined(interpreter: Interpreter, rows: list[Value], aval: Any) -> Value:
     if not rows:
         return np.zeros(aval.shape, aval.dtype)
-    if is_small(aval, interpreter.small) and not any(isinstance(x, Whole) for x in rows):
+    if is_small(aval, SMALL) and not any(isinstance(x, Whole) for x in rows):
         return tidy(np.stack([as_objects(x) for x in rows]), aval.dtype)
     one = jax.ShapeDtypeStruct(aval.shape[1:], aval.dtype)
     mapped = any(is_mapped(x) for x in rows)
@@ -244,7 +245,7 @@ def _cond(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[
     avals = [v.aval for v in equation.outvars]
     if not is_mapped(index):
         return _branch(interpreter, branches, index, operands, avals)
-    if equation.effects or not all(is_small(aval, interpreter.small) for aval in avals):
+    if equation.effects or not all(is_small(aval, SMALL) for aval in avals):
         raise NotWritableError
     graph, (number,) = interpreter.graph, unpack(index)
     kind = np.dtype(equation.invars[0].aval.dtype).type
@@ -280,7 +281,7 @@ def _branch(
 def _custom_derivative(interpreter: Interpreter, equation: Any, values: list[Value]) -> list[Value]:
     """The function in scalars; its derivatives are those of the vmapped equation, which keeps the custom rule."""
     avals = [v.aval for v in equation.outvars]
-    if any(isinstance(x, Whole) for x in values) or not all(is_small(a, interpreter.small) for a in avals):
+    if any(isinstance(x, Whole) for x in values) or not all(is_small(a, SMALL) for a in avals):
         raise NotWritableError
     flags = [any(is_mapped(x) for x in values)] * len(avals)
     interpreter.settle(values)

@@ -52,7 +52,6 @@ class Interpreter:
     graph: Graph
     control: Mapping[str, Callable[..., Sequence[Value]]]  # of primitives with inner jaxprs: (self, equation, values)
     unroll: int = UNROLL
-    small: int = SMALL
 
     def inner(self) -> "Interpreter":
         """Interpreter for the trace of a loop's or a branch's body."""
@@ -87,7 +86,7 @@ class Interpreter:
         special = self.control.get(name)
         constant = all(is_number(x) for x in values)
         outs = [v.aval for v in equation.outvars]
-        limit = FOLD_LIMIT if constant else self.small
+        limit = FOLD_LIMIT if constant else SMALL
         whole = any(isinstance(x, Whole) for x in values)
         try:
             if special is not None:
@@ -136,7 +135,7 @@ class Interpreter:
 
     def take_apart(self, array: Any, mapped: bool, aval: Any) -> Value:
         """Value of an array that has the axis N in front if ``mapped``; ``aval`` is the type of one vehicle's."""
-        if not is_small(aval, self.small):
+        if not is_small(aval, SMALL):
             return Whole(array, mapped)
         if aval.size == 0:
             return np.zeros(aval.shape, aval.dtype)
@@ -185,7 +184,7 @@ class Interpreter:
 
     def dump(self, value: Value, aval: Any, mapped: bool) -> list[Any]:
         """Arrays of a value, spread over the vehicles if ``mapped``."""
-        if is_small(aval, self.small):
+        if is_small(aval, SMALL):
             if isinstance(value, Whole):
                 value = self.take_apart(value.array, value.mapped, aval)
             entries = self.graph.values(value.reshape(-1))
@@ -194,7 +193,7 @@ class Interpreter:
 
     def load(self, arrays: list[Any], aval: Any, mapped: bool) -> Value:
         """Value of dumped arrays, taken off the front of the list."""
-        if not is_small(aval, self.small):
+        if not is_small(aval, SMALL):
             return Whole(arrays.pop(0), mapped)
         if aval.size == 0:
             return np.zeros(aval.shape, aval.dtype)

@@ -16,11 +16,11 @@ import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from swarmsim.scalars.access import TOGETHER, Memory, MemoryGraph, Numbers, Rows, apart
+from swarmsim.scalars.access import Memory, MemoryGraph, Numbers, Rows, apart
 from swarmsim.scalars.control import CONTROL, loop_counts, while_by_vehicle
 from swarmsim.scalars.graph import Graph, Scalar, is_constant, varying_axes
 from swarmsim.scalars.indexing import full_start, gather_plan
-from swarmsim.scalars.interpreter import Interpreter, Value, Whole, is_number, is_small, needed
+from swarmsim.scalars.interpreter import SMALL, Interpreter, Value, Whole, is_number, is_small, needed
 from swarmsim.scalars.program import Program
 from swarmsim.scalars.rules import ADD, ELEMENTWISE, GE, LE, MAX, MIN, MUL, NotWritableError, pack
 
@@ -111,7 +111,7 @@ class _InKernel(Interpreter):
 
     def of_view(self, view: _View, mapped: bool, aval: Any) -> Value:
         """A view as a value: its entries, if there are few."""
-        if not is_small(aval, self.small):
+        if not is_small(aval, SMALL):
             return Whole(view, mapped or (not is_constant(view.offset) and view.offset.mapped))
         places = [_flat(view.strides, index) for index in np.ndindex(*view.shape)]
         return pack(self.entries(view, view.offset, places), aval.shape, aval.dtype)
@@ -196,7 +196,7 @@ def _row_major(shape: Sequence[int]) -> tuple[int, ...]:
 
 def _gather(interpreter: _InKernel, equation: Any, whole: Whole, operands: list[Value]) -> Value:
     view, (indices,), out = whole.array, operands, equation.outvars[0].aval
-    if not is_small(out, interpreter.small):
+    if not is_small(out, SMALL):
         raise NotInKernelError("gather of a large part")
     graph, plan = interpreter.graph, gather_plan(equation)
     read: list[Scalar] = []
@@ -267,13 +267,6 @@ class _Operand:
     rows: Rows
 
 
-def _operand(
-    program: Program, size: int, total: int, of_vehicle: bool, of_mission: bool, variable: Any
-) -> _Operand:  # fmt: skip
-    stride = (total if of_mission else size) if program.beside and of_vehicle else 1
-    return _Operand(variable.aval, Rows(of_vehicle, of_mission, variable.aval.size, stride))
-
-
 def _launch(
     program: Program, size: int, mapped: Sequence[bool], own: Sequence[bool], missions: int, arrays: Sequence[Any],
     returned: Sequence[int], interpret: bool,
@@ -284,10 +277,10 @@ def _launch(
 
     total = missions * size
     flags = zip(mapped, own, program.variables, strict=True)
-    operands = [_operand(program, size, total, *own) for own in flags]
+    operands = [_Operand(v.aval, Rows(of_vehicle, of_mission, v.aval.size)) for of_vehicle, of_mission, v in flags]
     given = [(o, a) for o, a in zip(operands, arrays, strict=True) if _in_memory(o.aval)]
     outs = [v.aval for v in program.jaxpr.outvars]
-    if not all(_in_memory(a) or a.size == 0 for a in outs) or any(not is_small(a, program.small) for a in outs):
+    if not all(_in_memory(a) or a.size == 0 for a in outs) or any(not is_small(a, SMALL) for a in outs):
         raise NotInKernelError("results that are not taken apart")
     if any(map(varying_axes, arrays)):
         raise NotInKernelError("a kernel does not say on which axes of a mesh its results depend")
@@ -300,13 +293,11 @@ def _launch(
         place = pl.program_id(0) * block + lax.iota(jnp.int32, block)
         vehicle = lax.min(place, jnp.full(block, total - 1, jnp.int32))  # threads beyond the last one read the last
         memory = Memory(size, vehicle)
-        graph = MemoryGraph(block, memory=memory, together=TOGETHER if program.beside else None)
+        graph = MemoryGraph(block, memory=memory)
         (nothing,) = graph.values([graph.read(refs[0], Rows(False, False, 1), np.int32(0), 0)])
-        interpreter = _InKernel(
-            graph, {**CONTROL, "scan": _scan, "while": _while}, program.unroll, program.small, nothing
-        )  # fmt: skip
+        interpreter = _InKernel(graph, {**CONTROL, "scan": _scan, "while": _while}, program.unroll, nothing)
         results = _evaluated(program, operands, iter(refs[1 : 1 + len(given)]), interpreter)
-        _store(place, total, list(zip(refs[1 + len(given) :], results, strict=True)), program.beside)
+        _store(place, total, list(zip(refs[1 + len(given) :], results, strict=True)))
 
     call = pl.pallas_call(
         kernel,
@@ -314,24 +305,12 @@ def _launch(
         in_specs=[pl.BlockSpec(memory_space=pl.ANY)] * (1 + len(given)),
         out_specs=[pl.BlockSpec(memory_space=pl.ANY)] * len(stored),
         out_shape=[jax.ShapeDtypeStruct((total * a.size,), a.dtype) for a in stored],
-        input_output_aliases={} if program.beside else _aliases(operands, outs, returned, missions),
+        input_output_aliases=_aliases(operands, outs, returned, missions),
         interpret=interpret,
         compiler_params=None if interpret else triton.CompilerParams(num_warps=block // _WARP, num_stages=1),
     )
-    made = iter(call(jnp.zeros(1, jnp.int32), *[_in_order(o.rows, a) for o, a in given]))
-
-    def result(aval: Any) -> jax.Array:
-        if not aval.size:
-            return jnp.zeros((total, *aval.shape), aval.dtype)
-        made_ = next(made)
-        return (made_.reshape(aval.size, total).T if program.beside else made_).reshape(total, *aval.shape)
-
-    return [result(a) for a in outs]
-
-
-def _in_order(rows: Rows, array: jax.Array) -> jax.Array:
-    """The entries of an argument as the kernel finds them."""
-    return jnp.reshape(jnp.reshape(array, (rows.stride, rows.entries)).T if rows.stride > 1 else array, -1)
+    made = iter(call(jnp.zeros(1, jnp.int32), *[jnp.reshape(a, -1) for _, a in given]))
+    return [next(made).reshape(total, *a.shape) if a.size else jnp.zeros((total, *a.shape), a.dtype) for a in outs]
 
 
 def _aliases(
@@ -378,23 +357,19 @@ def _evaluated(program: Program, operands: Sequence[_Operand], refs: Any, interp
     return [[_typed(x, aval) for x in interpreter.dump(value, aval, True)] for value, aval in outs]
 
 
-def _store(place: jax.Array, total: int, results: Sequence[tuple[Any, list[Any]]], beside: bool) -> None:
-    """Write the entries of each result [threads] to its array; the vehicle of a thread is the one at its ``place``.
-
-    ``beside``: the same entry of all vehicles side by side.
-    """
+def _store(place: jax.Array, total: int, results: Sequence[tuple[Any, list[Any]]]) -> None:
+    """Write the entries of each result [threads] to its array; the vehicle of a thread is the one at its ``place``."""
     from jax.experimental.pallas import triton
 
     sizes = {len(entries) for _, entries in results}
-    firsts = [place if beside else place * np.int32(size) for size in sizes]
-    step = total if beside else 1
+    firsts = [place * np.int32(size) for size in sizes]
 
     def work(number: Numbers, given: Sequence[Any]) -> list[Any]:
         written, *rest = given
         first, left = dict(zip(sizes, rest, strict=False)), iter(rest[len(sizes) :])
         for ref, entries in results:
             for at in range(len(entries)):
-                triton.store(ref.at[number.after(at * step, first[len(entries)])], next(left), mask=written)
+                triton.store(ref.at[number.after(at, first[len(entries)])], next(left), mask=written)
         return []
 
     apart(work, [place < total, *firsts, *(x for _, entries in results for x in entries)], [])

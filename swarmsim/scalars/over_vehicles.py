@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.scalars.interpreter import SMALL, UNROLL, is_foldable
+from swarmsim.scalars.interpreter import UNROLL, is_foldable
 from swarmsim.scalars.kernel import on_gpu
 from swarmsim.scalars.program import Program, on_cpu
 
@@ -33,8 +33,6 @@ def over_vehicles(
     layout: Layout = "scalars",
     *,
     unroll: int = UNROLL,
-    small: int = SMALL,
-    beside: bool = False,
     returned: Sequence[int] = (),
     platform: str | None = None,
 ) -> Callable[..., Any]:
@@ -47,7 +45,7 @@ def over_vehicles(
 
     Arrays that all vehicles share (axis None) are traced values if they are, and otherwise constants, which are folded:
     pass parameters as numpy arrays to have them compiled in. So are mapped arrays that are known while tracing and are
-    the same for all vehicles. Arrays of more than ``small`` elements are not taken apart, nor
+    the same for all vehicles. Arrays of more than 64 elements are not taken apart, nor
     are operations that have no form in scalars (random bits, sorting, linear solvers): these are vmapped one by one.
 
     Args:
@@ -56,10 +54,6 @@ def over_vehicles(
             Keyword arguments are mapped over axis 0. All results have the vehicles' axis in front.
         layout: ``scalars``, or ``vmap`` for `jax.vmap` itself.
         unroll: longest `jax.lax.scan` inside ``function`` that is written out; longer ones carry scalars.
-        small: largest array of one vehicle, in elements, that is taken apart.
-        beside: whether a kernel of a GPU reads and writes arrays in which the same entry of all vehicles stands side by
-            side, as threads that are neighbours read them fastest. What comes from such a kernel or goes to one is so
-            already; anything else has to be turned around.
         returned: numbers of the arguments, all of them mapped, that come back as the first results, leaf for leaf: a
             kernel of a GPU then writes them in place, which saves a loop around it a copy.
         platform: that the program will run on, by default JAX's own; see `swarmsim.scalars.program.on_cpu`.
@@ -85,7 +79,7 @@ def over_vehicles(
         ]
         varied = [axis is not None for axis in leaf_axes]
         alike = _alike(moved, leaf_axes, args, returned)
-        program, arrays, structure = _program(function, tree, moved, varied, alike, unroll, small, beside)
+        program, arrays, structure = _program(function, tree, moved, varied, alike, unroll)
         own = sum(varied) - len(alike)
         of_vehicle = [False] * (len(arrays) - own) + [True] * own
         arranged = _ARRANGED.get(platform or jax.default_backend())
@@ -153,14 +147,7 @@ def _vehicles(leaves: list[Any], axes: list[int | None]) -> int:
 
 
 def _program(
-    function: Callable[..., Any],
-    tree: Any,
-    leaves: list[Any],
-    varied: list[bool],
-    alike: dict[int, Any],
-    unroll: int,
-    small: int,
-    beside: bool,
+    function: Callable[..., Any], tree: Any, leaves: list[Any], varied: list[bool], alike: dict[int, Any], unroll: int
 ) -> Any:
     """The function of one vehicle as a `Program` with its arguments, and the structure of its results.
 
@@ -191,5 +178,5 @@ def _program(
         else:
             variables.append(variable)
             arrays.append(value)
-    program = Program(closed.jaxpr, constants, tuple(variables), unroll, small, beside)
+    program = Program(closed.jaxpr, constants, tuple(variables), unroll)
     return program, arrays, jax.tree.structure(shape)

@@ -13,7 +13,7 @@ from jax.extend import core
 
 from swarmsim.scalars.control import CONTROL
 from swarmsim.scalars.graph import Graph, store, varying_axes
-from swarmsim.scalars.interpreter import Interpreter, is_small
+from swarmsim.scalars.interpreter import SMALL, Interpreter, is_small
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,6 @@ class Program:
     constants: dict[Any, np.ndarray]  # values of variables that are known
     variables: tuple[Any, ...]  # constants and inputs of the jaxpr that are arguments
     unroll: int  # longest scan that is written out
-    small: int  # elements of the largest array of one vehicle that is taken apart
-    beside: bool = False  # whether a kernel finds entries of all vehicles side by side in memory
 
     def evaluate(self, size: int, mapped: Sequence[bool], *arrays: Any, stores: bool = False) -> list[jax.Array]:
         """Results [N, ...] for N = ``size`` vehicles, as operations on scalars; ``mapped`` arguments have the axis N.
@@ -33,7 +31,7 @@ class Program:
         With ``stores``, results that much depends on are kept in memory (`swarmsim.scalars.graph.to_store`).
         """
         varying: frozenset[str] = frozenset().union(*map(varying_axes, arrays))
-        interpreter = Interpreter(Graph(size, varying, stores), CONTROL, self.unroll, self.small)
+        interpreter = Interpreter(Graph(size, varying, stores), CONTROL, self.unroll)
         known: dict[Any, Any] = dict(self.constants)
         for variable, array, of_vehicle in zip(self.variables, arrays, mapped, strict=True):
             known[variable] = interpreter.take_apart(array, of_vehicle, variable.aval)
@@ -86,7 +84,7 @@ def on_cpu(program: Program, size: int, mapped: Sequence[bool]) -> Callable[...,
 def _can_join(program: Program, mapped: Sequence[bool], own: Sequence[bool]) -> bool:
     """Whether every argument that has one of the axes is small enough to be repeated along the other."""
     repeated = zip(program.variables, mapped, own, strict=True)
-    return all(is_small(v.aval, program.small) for v, of_vehicle, of_mission in repeated if of_vehicle != of_mission)
+    return all(is_small(v.aval, SMALL) for v, of_vehicle, of_mission in repeated if of_vehicle != of_mission)
 
 
 def _joined(array: Any, missions: int, size: int, of_vehicle: bool, of_mission: bool) -> Any:

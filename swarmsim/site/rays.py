@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.device import on_processor, thread_by_thread
+from swarmsim.device import on_processor
 from swarmsim.pytree import pytree
 from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site, sample
@@ -24,7 +24,6 @@ from swarmsim.site.shapes import (
     nothing_met,
     of_both,
     shaped,
-    shaped_of_many,
     stretched,
     walls_of_materials,
     wide,
@@ -35,8 +34,6 @@ from swarmsim.site.terrain_crossing import Ceilings, ceilings, share_below
 NEIGHBOURS = 16  # segments that are intersected with the same clusters of boxes
 PAIRS = 128  # of a segment and a box, of which shares are computed at a time
 PAIRS_OF_MANY = 128  # the same of each of many places, on an accelerator
-PAIRS_OF_ALL = 2**17  # the same of all places together, on an accelerator
-BITS = 32  # of an integer: boxes of which a thread finds those that it meets
 CLUSTER = 16  # boxes, a multiple of the SIMD width; the last cluster is filled up with empty ones
 LOW_M = 2.0  # height at which half of the ground is left of what a low source in a building sees of it
 _TOUCH_M = 1e-3  # boxes so near to a segment count as met, for rounding
@@ -269,19 +266,13 @@ def _near(boxes: Obstacles, a: jax.Array, ends: jax.Array) -> jax.Array:
 
 
 def by_threads(
-    site: Site,
-    a: jax.Array,
-    b: jax.Array,
-    wanted: jax.Array | None = None,
-    platform: str | None = None,
-    throughout: bool | None = None,
+    site: Site, a: jax.Array, b: jax.Array, wanted: jax.Array | None = None, platform: str | None = None
 ) -> Crossed:
     """`crossed_from` with a thread for each segment, which goes through the boxes and over the terrain by itself.
 
-    ``platform`` is that of `swarmsim.scalars.over_vehicles`; ``throughout``, whether all that follows is done
-    `thread_by_thread` as well.
+    ``platform`` is that of `swarmsim.scalars.over_vehicles`.
     """
-    above, throughout = above_of(site), thread_by_thread() if throughout is None else throughout
+    above = above_of(site)
     of_metre = walls_of_materials(site)
     needed = (site.obstacles, of_metre, site.terrain_m, site.origin_m, site.cell_m, site.ground_material)
     nothing, shapes = np.zeros(1, np.float32), above.shapes
@@ -297,16 +288,14 @@ def by_threads(
         )  # fmt: skip
         ceiling = Ceilings(highest_m=heights[0], around_m=heights[1], shapes=shapes)
         # without an end that a segment has of its own the loop has a derivative of every kind
-        some = partial(_some_boxes if throughout else _box_after_box, followed=followed)
-        return _way(here, ceiling, start, end, _box_after_box if wanted is None else some)
+        boxes = _box_after_box if wanted is None else partial(_box_after_box, followed=followed)
+        return _way(here, ceiling, start, end, boxes)
 
     starts = jnp.broadcast_to(a, b.shape)
     followed = jnp.ones(b.shape[0], bool) if wanted is None else wanted
-    ways: Way = over_vehicles(one, (0, 0, 0, None, None), beside=throughout, platform=platform)(
+    ways: Way = over_vehicles(one, (0, 0, 0, None, None), platform=platform)(
         b, followed, starts, needed, (above.highest_m, above.around_m)
     )
-    if throughout:
-        return shaped_of_many(site.obstacles, of_metre, starts, b, ways, PAIRS_OF_ALL, platform)
     return shaped(site.obstacles, of_metre, starts, b, ways, PAIRS_OF_MANY)
 
 
@@ -362,39 +351,6 @@ def _box_after_box(
     number = boxes.wall_m.shape[0]
     last = number if followed is None else jnp.where(followed, number, 0)
     return jax.lax.fori_loop(0, last, add, _nothing_found(materials.shape[0]))
-
-
-def _some_boxes(
-    site: Site, a: jax.Array, direction: jax.Array, distance: jax.Array, *, followed: jax.Array
-) -> _Found:  # fmt: skip
-    """What a segment meets; nothing if it is not ``followed`` [], which costs nothing if no neighbour is.
-
-    Of so many boxes as a number has bits, those that it meets are found first, and then looked at one after another:
-    threads that are neighbours meet few, and those in step.
-    """
-    boxes, number = site.obstacles, site.obstacles.wall_m.shape[0]
-
-    def box(k: jax.Array) -> Obstacles:
-        return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, jnp.minimum(k, number - 1), 1), boxes)
-
-    def some(part: jax.Array, found: _Found) -> _Found:
-        first = part * BITS
-
-        def meets(bit: jax.Array, bits: jax.Array) -> jax.Array:
-            yes = _meets(box(first + bit), a, direction)[0] & (first + bit < number)
-            return jnp.where(yes, bits | jax.lax.shift_left(jnp.int32(1), bit), bits)
-
-        def next_(carry: tuple[jax.Array, _Found]) -> tuple[jax.Array, _Found]:
-            bits, found = carry
-            k = first + jax.lax.population_count(~bits & (bits - 1))  # that of the lowest bit
-            own = _of_box(site, box(k), k, a, direction, distance)
-            return bits & (bits - 1), _together(found, own)
-
-        bits = jax.lax.fori_loop(0, BITS, meets, jnp.int32(0))
-        return jax.lax.while_loop(lambda carry: carry[0] != 0, next_, (bits, found))[1]
-
-    parts = jnp.where(followed, -(-number // BITS), 0)
-    return jax.lax.fori_loop(0, parts, some, _nothing_found(len(site.material_names)))
 
 
 def _of_boxes(

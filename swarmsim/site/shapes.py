@@ -6,16 +6,12 @@ alone that meet any.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 
 from swarmsim.device import at_most
 from swarmsim.pytree import pytree
-from swarmsim.scalars import over_vehicles
 from swarmsim.site.model import Obstacles, Site
 from swarmsim.site.surfaces import Box
 from swarmsim.site.wall_network import OUTPUTS, scattered
@@ -118,126 +114,33 @@ def shaped(
 
     With ``size``, so many pairs of a segment and a box at a time: many segments meet none. Else all together.
     """
-    a, b = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b)
-    density = of_metre[boxes.material]
-    return _with_shape(way, _mixed(size, False, None, boxes, density, _numbers(way), a, b, way.boxes, way.walls))
-
-
-def shaped_of_many(
-    boxes: Obstacles,
-    of_metre: jax.Array,
-    a: jax.Array,
-    b: jax.Array,
-    way: Way,
-    size: int,
-    platform: str | None = None,
-) -> Crossed:
-    """`shaped`, for which `jax.vmap` puts the segments of all together, and computes ``size`` pairs at a time of all.
-
-    Each by itself would fill up its last group, and all would wait for the one with the most pairs.
-    """
-    mixed = custom_vmap(partial(_mixed, size, True, platform))
-
-    @mixed.def_vmap
-    def of_all(many: int, own: Any, boxes: Obstacles, density: jax.Array, *of_segments: jax.Array) -> Any:
-        own_boxes, own_density, *own_of_segments = own
-
-        def of_each(x: jax.Array, mine: bool) -> jax.Array:
-            return x if mine else jnp.broadcast_to(x, (many, *x.shape))
-
-        met, *rest = map(of_each, of_segments, own_of_segments)
-        if any(jax.tree.leaves((own_boxes, own_density))):
-            first = density.shape[-1] * jnp.arange(many)
-            met = jnp.where(met >= 0, met + first[:, None, None], met)
-            boxes, density = jax.tree.map(of_each, (boxes, density), (own_boxes, own_density))
-            boxes, density = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (boxes, density))
-        flat = [x.reshape(-1, *x.shape[2:]) for x in (met, *rest)]
-        found = mixed(boxes, density, *flat)
-        return jax.tree.map(lambda x: x.reshape(many, -1, *x.shape[1:]), found), (True,) * len(found)
-
-    a, b, metre = (jax.lax.stop_gradient(x) for x in (a, b, of_metre))
-    boxes = jax.tree.map(jnp.asarray, boxes)
-    return _with_shape(way, mixed(boxes, metre[boxes.material], _numbers(way), a, b, way.boxes, way.walls))
-
-
-def _with_shape(way: Way, mixed: tuple[jax.Array, jax.Array, jax.Array]) -> Crossed:
-    coefficients, closed, walls = mixed
-    shape = Shape(
-        thin_m=way.thin_m, scattered=coefficients, closed=closed, walls=walls, ground=way.ground, low=way.low
-    )  # fmt: skip
-    return replace(way.crossed, shape=shape)
-
-
-def _numbers(way: Way) -> jax.Array:
-    """Numbers [n, 3] of the boxes with the most matter; -1 for none."""
-    keys = jnp.stack([way.met.first, way.met.second, way.met.third], axis=-1)
-    return jnp.where(keys > 0, keys & ~_UPPER, -1)
-
-
-def _mixed(
-    size: int | None,
-    throughout: bool,
-    platform: str | None,
-    boxes: Obstacles,
-    density: jax.Array,
-    met: jax.Array,
-    a: jax.Array,
-    b: jax.Array,
-    in_boxes: jax.Array,
-    in_walls: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Coefficients [n, OUTPUTS], closed [n] and walls [n] of a `Shape`, of all boxes that a segment meets.
-
-    ``density`` [K] is what a metre of each box counts, ``met`` [n, 3] are `_numbers`, ``in_boxes`` and ``in_walls`` [n]
-    the matter of `Way`.
-    """
-    n, pairs = a.shape[0], met.T.reshape(-1)
+    a, b, n = jax.lax.stop_gradient(a), jax.lax.stop_gradient(b), b.shape[0]
+    keys = jnp.concatenate([way.met.first, way.met.second, way.met.third])
 
     def of(pair: jax.Array) -> jax.Array:
         """Length the short way, coefficients, closed, and walls less 1 [OUTPUTS + 3, k] of pairs [k]."""
         row = pair % n
-        of_photons, around = scattered(_box(boxes, pairs[pair], a[row], b[row]))
+        of_photons, around = scattered(_box(boxes, keys[pair], a[row], b[row]))
         return jnp.concatenate([around.thin_m[None], of_photons, around.closed[None], around.walls[None] - 1.0])
 
-    of_metre = jnp.take(density, met, mode="clip")
-    if size is None:
-        return _put_together(of(jnp.arange(3 * n)).reshape(-1, 3, n), of_metre.T, met.T, in_boxes, in_walls)
-    found, place = _packed(of, pairs >= 0, size)
-    if not throughout:
-        return _put_together(found[:, place].reshape(-1, 3, n), of_metre.T, met.T, in_boxes, in_walls)
-
-    def one(place: jax.Array, own: Any, found: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return _put_together(found.at[:, place].get(mode="promise_in_bounds"), *own)
-
-    every = over_vehicles(one, (0, 0, None), beside=True, platform=platform)
-    mixed: tuple[jax.Array, jax.Array, jax.Array] = every(
-        place.reshape(3, n).T, (of_metre, met, in_boxes, in_walls), found
-    )
-    return mixed
-
-
-def _put_together(
-    each: jax.Array, of_metre: jax.Array, met: jax.Array, in_boxes: jax.Array, in_walls: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The results of `_mixed` from those of each pair [OUTPUTS + 3, 3, ...], of boxes with a density ``of_metre``."""
-    matter = jnp.where(met >= 0, each[0] * of_metre, 0.0)
+    each = (of(jnp.arange(3 * n)) if size is None else _packed(of, keys > 0, size)).reshape(-1, 3, n)
+    matter = jnp.where(keys > 0, each[0].reshape(-1) * of_metre[_row(boxes.material, keys)], 0.0).reshape(3, n)
     # What is left may be a box that is about to change places with the third, which then has no weight of its own but
     # this small one, for boxes that are all alike.
     least = jnp.min(matter, axis=0)
-    left = jnp.minimum(jnp.maximum(in_boxes - jnp.sum(matter, axis=0), 0.0), least)
+    left = jnp.minimum(jnp.maximum(way.boxes - jnp.sum(matter, axis=0), 0.0), least)
     own = matter - left * left / jnp.maximum(matter, 1e-9) + ALIKE * matter
-    weight = own * in_boxes / (jnp.maximum(jnp.sum(own, axis=0), 1e-9) * jnp.maximum(in_walls, 1e-9))
+    weight = own * way.boxes / (jnp.maximum(jnp.sum(own, axis=0), 1e-9) * jnp.maximum(way.walls, 1e-9))
     more = [jnp.sum(jnp.where(weight > 0.0, weight * x, 0.0), axis=0) for x in each[1:]]
-    return jnp.stack(more[:-2], axis=-1), more[-2], 1.0 + more[-1]
+    shape = Shape(
+        thin_m=way.thin_m, scattered=jnp.stack(more[:-2], axis=-1), closed=more[-2], walls=1.0 + more[-1],
+        ground=way.ground, low=way.low,
+    )  # fmt: skip
+    return replace(way.crossed, shape=shape)
 
 
-def _packed(
-    function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int
-) -> tuple[jax.Array, jax.Array]:  # fmt: skip
-    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; and where each [n] is among them.
-
-    Those that are not wanted are anywhere.
-    """
+def _packed(function: Callable[[jax.Array], jax.Array], wanted: jax.Array, size: int) -> jax.Array:
+    """``function`` [k, size] of the ``wanted`` [n] numbers, ``size`` at a time; of the others anything."""
     n, place = wanted.shape[0], jnp.cumsum(wanted.astype(jnp.int32)) - 1
     size = min(size, n)
     rows = jnp.zeros(n + size, jnp.int32).at[jnp.where(wanted, place, n + size)].set(jnp.arange(n), mode="drop")
@@ -247,18 +150,20 @@ def _packed(
         own = function(jax.lax.dynamic_slice(rows, (first,), (size,)))
         return jax.lax.dynamic_update_slice(found, own, (jnp.zeros_like(first), first))
 
-    count = -(-(place[-1] + 1) // size)
-    found = jax.lax.fori_loop(
-        0, at_most(count), step, jnp.zeros((OUTPUTS + 3, n + size))
-    )  # fmt: skip
-    return found, jnp.maximum(place, 0)
+    found = jax.lax.fori_loop(0, at_most(-(-(place[-1] + 1) // size)), step, jnp.zeros((OUTPUTS + 3, n + size)))
+    return found[:, jnp.maximum(place, 0)]
 
 
-def _box(boxes: Obstacles, number: jax.Array, a: jax.Array, b: jax.Array) -> Box:
-    """The boxes of these numbers [n], with segments from ``a`` [n, 3] to ``b`` [n, 3]."""
-    own = jax.tree.map(lambda x: jnp.take(x, number, axis=0, mode="clip"), boxes)
+def _box(boxes: Obstacles, key: jax.Array, a: jax.Array, b: jax.Array) -> Box:
+    """The boxes of these keys [n], with segments from ``a`` [n, 3] to ``b`` [n, 3]."""
+    own = jax.tree.map(lambda x: _row(x, key), boxes)
     start, end = (in_axes(own, x - own.centre_m) for x in (a, b))
     return Box(start, end, [own.half_extent_m[:, k] for k in range(3)], own.wall_m)
+
+
+def _row(x: jax.Array, key: jax.Array) -> jax.Array:
+    """What ``x`` [K, ...] is of the boxes of these keys [n]."""
+    return jnp.take(x, key & ~_UPPER, axis=0, mode="clip")
 
 
 def most_of(matter: jax.Array) -> Most:

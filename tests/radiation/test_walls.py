@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from swarmsim.radiation import Detector, roi_rates, spectrum_rate
+from swarmsim.radiation import Detector, roi_lines, roi_rates, spectrum_rate
 from swarmsim.radiation.detector import AIR, Source
 from swarmsim.radiation.rate import from_ground, line_rates, transmission
-from swarmsim.radiation.roi_lines import RoiRates, lines_of, roi_rates_and_slopes
+from swarmsim.radiation.roi_lines import RoiRates, roi_rates_and_slopes
 from swarmsim.radiation.walls import MOST
 from swarmsim.site import Crossed
 from swarmsim.site.rays import Shape, stretched
@@ -85,25 +85,29 @@ def test_derivatives_are_numbers_for_nuclides_of_few_lines_as_well(detectors: De
         assert np.any(np.asarray(slopes[1, 0]) != 0.0)
 
 
-def test_of_many_nuclides_each_has_its_own_lines(detectors: Detectors) -> None:
-    """All go through as many lines as that with most of them has; what is not asked for adds nothing."""
+def test_an_accelerator_takes_some_lines_at_a_time(detectors: Detectors, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as the nuclide with most of them has; their number need not be a multiple."""
     d = detectors["nai_2x2", "physical"]
     ways = [shaped(through(d, **matter), 0.5, 1.0) for matter in ({"air": 9.0}, {"concrete": 0.2, "air": 9.0})]
     way = jax.tree.map(lambda *x: jnp.stack(x), *ways)
     places, axes, by = jnp.tile(PLACE, (2, 1)), jnp.tile(UP, (2, 1)), (d.material_names.index("concrete"),)
     sources = [point(d, name) for name in ("Co-60", "Cs-137", "Eu-152")]
+    own = np.asarray(d.yields)[[int(source.nuclide) for source in sources]]
+    most = int(np.max(np.flatnonzero(own.any(axis=0)))) + 1
     alone = [roi_rates_and_slopes(d, source, way, places, axes, by) for source in sources]
+    monkeypatch.setattr(roi_lines, "on_processor", lambda: False)
+    together = next(k for k in range(2, 9) if most % k and d.yields.shape[1] % k)
+    monkeypatch.setattr(roi_lines, "LINES_TOGETHER", together)
     every = jax.tree.map(lambda *x: jnp.stack(x), *sources)
     found = jax.vmap(lambda source: roi_rates_and_slopes(d, source, way, places, axes, by))(every)
     for number, one in enumerate(alone):
         for x, y in zip(found, one, strict=True):
             np.testing.assert_allclose(x[number], y, rtol=2e-5, atol=1e-6 * float(jnp.max(jnp.abs(y))))
+    asked = jnp.array([True, False, True])  # one of them for nothing
 
     def some(source: Source, asked: jax.Array) -> RoiRates:
-        lines = lines_of(d, source.nuclide, asked)
-        return roi_rates_and_slopes(d, source, way, places, axes, by, lines=lines)
+        return roi_rates_and_slopes(d, source, way, places, axes, by, asked=asked)
 
-    asked = jnp.array([True, False, True])  # one of them for nothing
     for one, other in zip(jax.vmap(some)(every, asked), found, strict=True):
         np.testing.assert_allclose(one[asked], other[asked], rtol=1e-6)
     assert not any(jnp.any(x) for x in some(sources[1], jnp.array(False)))

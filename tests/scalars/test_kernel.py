@@ -236,34 +236,3 @@ def test_what_has_no_form_in_a_kernel_is_left_to_xla(function):
     assert kernels_in(mapped, x3) == 0
     assert_alike(jax.jit(mapped)(x3), jax.vmap(function)(x3))
     assert_alike(jax.jit(jax.vmap(mapped))(MISSIONS), jax.vmap(jax.vmap(function))(MISSIONS))
-
-
-def summed_up(x, long, shared):
-    """Reads by which others find their place, of vehicles and of a mission."""
-    first = jnp.clip(jnp.int32(10.0 * jnp.abs(x[0])), 0, 20)
-    at = jnp.clip(jnp.int32(10.0 * jnp.abs(long[first, 0])), 0, 29)
-    return long[at] * x[1] + jnp.sum(long[:20]) * x[2] + shared[at % 3], jnp.sum(shared * x)
-
-
-@pytest.mark.parametrize("missions", [False, True])
-def test_entries_of_all_vehicles_side_by_side_are_the_same_ones(missions):
-    """Read some at a time, in the order of their use; arrays that a mission's vehicles share stay as they are."""
-    mapped = in_kernel(summed_up, in_axes=(0, 0, None), beside=True, small=128)
-    plain = jax.vmap(summed_up, in_axes=(0, 0, None))
-    shared = numbers(3, seed=4)[0]
-    args = x3, LONG, shared
-    if missions:
-        mapped, plain = (jax.vmap(f, in_axes=(0, None, 0)) for f in (mapped, plain))
-        args = MISSIONS, LONG, jnp.stack([shared, 2.0 * shared, -shared])
-    assert kernels_in(mapped, *args) == 1
-    assert_alike(jax.jit(mapped)(*args), jax.jit(plain)(*args))
-
-
-def test_a_larger_array_is_taken_apart_on_demand():
-    def product(x):
-        outer = jnp.outer(jnp.concatenate([x, 2.0 * x, x + 1.0]), jnp.concatenate([x, x - 1.0, x * x]))  # 81 entries
-        return outer[:, 3], jnp.trace(outer)
-
-    assert kernels_in(in_kernel(product, small=81), x3) == 1
-    assert kernels_in(in_kernel(product), x3) == 0
-    assert_alike(jax.jit(in_kernel(product, small=81))(x3), jax.vmap(product)(x3))

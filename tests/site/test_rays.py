@@ -183,8 +183,7 @@ def test_gradient_equals_difference():
     np.testing.assert_allclose(gradient, difference, atol=2e-3)
 
 
-@pytest.mark.parametrize("throughout", [False, True])
-def test_a_thread_for_each_segment_crosses_the_same(throughout):
+def test_a_thread_for_each_segment_crosses_the_same():
     """The way of an accelerator, evaluated without one, for several beginnings at once."""
     rng = np.random.default_rng(2)
     site = make_site([
@@ -196,12 +195,9 @@ def test_a_thread_for_each_segment_crosses_the_same(throughout):
     expected = jax.jit(jax.vmap(lambda a: crossed_from(site, a, ends)))(starts)
 
     def all_threads(site, starts):
-        def of(a):
-            return by_threads(site, a, ends, platform="gpu, interpreted", throughout=throughout)
+        return jax.vmap(lambda a: by_threads(site, a, ends, platform="gpu, interpreted"))(starts)
 
-        return jax.vmap(of)(starts)
-
-    assert str(jax.make_jaxpr(all_threads)(site, starts)).count("pallas_call[") == 1 + throughout
+    assert str(jax.make_jaxpr(all_threads)(site, starts)).count("pallas_call[") == 1
     found = jax.jit(all_threads)(site, starts)
     np.testing.assert_allclose(found.length_m, expected.length_m, atol=1e-4)
     np.testing.assert_allclose(found.place, expected.place, atol=1e-4)
@@ -261,12 +257,8 @@ def test_an_end_that_is_no_number_hides_nothing_from_its_neighbours():
     assert expected[:, CONCRETE].min() > 0.9
 
 
-@pytest.mark.parametrize("throughout", [False, True])
-def test_what_is_wanted_is_crossed_as_if_all_were(throughout):
-    beside = [
-        ((5.0, 50.0 + k, 1.0), (0.5, 0.4, 3.0), 0.0, 0.0, "concrete") for k in range(40)
-    ]  # more than an integer has bits
-    site = make_site([*beside, ((5.0, 0.0, 1.0), (0.5, 20.0, 3.0), 0.0, 0.0, "concrete")])
+def test_what_is_wanted_is_crossed_as_if_all_were():
+    site = make_site([((5.0, 0.0, 1.0), (0.5, 20.0, 3.0), 0.0, 0.0, "concrete")])
     start = jnp.array([0.0, 0.0, 1.0])
     ends = jnp.array([[10.0, y, 1.0] for y in np.linspace(-3.0, 3.0, 53)], jnp.float32)
     wanted = (jnp.arange(53) % 5 == 0) & ((jnp.arange(53) < 16) | (jnp.arange(53) >= 32))
@@ -278,7 +270,7 @@ def test_what_is_wanted_is_crossed_as_if_all_were(throughout):
     assert np.all(np.asarray(some.length_m)[between] == 0.0)
     assert np.all(np.asarray(some.shape.scattered)[between] == 0.0)
     assert np.all(np.asarray(every.length_m)[between, CONCRETE] > 0.9)
-    threads = jax.jit(lambda wanted: by_threads(site, start, ends, wanted, "gpu, interpreted", throughout))(wanted)
+    threads = jax.jit(lambda wanted: by_threads(site, start, ends, wanted, "gpu, interpreted"))(wanted)
     for one, other in zip(jax.tree.leaves(threads), jax.tree.leaves(every), strict=True):
         np.testing.assert_allclose(np.asarray(one)[wanted], np.asarray(other)[wanted], rtol=1e-4, atol=1e-4)
     assert np.all(np.asarray(threads.shape.scattered)[~wanted] == 0.0)
