@@ -9,12 +9,15 @@ import jax.numpy as jnp
 from swarmsim import randomness
 from swarmsim.estimation import (
     Estimated,
+    Hotspots,
     Measurements,
+    RadiationMap,
     concatenate,
     extract_hotspots,
     interpolate,
     localise,
 )
+from swarmsim.estimation.localise import nothing_found
 from swarmsim.estimation.nodes import Span, spans_of
 from swarmsim.estimation.state import State
 from swarmsim.estimation.windows import Windows, measured, merged
@@ -104,26 +107,40 @@ def nothing_learned(world: World, plan: Plan, windows: tuple[Windows | None, ...
     """A survey of no counts; None for a mission that does not estimate sources."""
     if not plan.estimates:
         return None
-    shape = jax.eval_shape(lambda: survey(plan, *gathered(world, plan, windows, key), None))
-    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+    assert plan.localisation is not None
+    assert plan.presumed is not None
+    presumed, params = plan.presumed, plan.localisation
+
+    def nothing() -> Survey:
+        measurements, spans = gathered(world, plan, windows, key)
+        estimated = nothing_found(presumed, measurements, spans, params)
+        chart, hotspots = _mapped(plan, measurements)
+        return Survey(map=chart, hotspots=hotspots, estimated=estimated, found=estimated.fits.present[0])
+
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(nothing))
 
 
 def survey(plan: Plan, measurements: Measurements, spans: tuple[Span, ...], known: State | None) -> Survey:
-    """Interpolate the map, find hotspots, and estimate the sources, from where an earlier estimate came to.
+    """Interpolate the map, find hotspots, and estimate the sources, from where an earlier estimate came to."""
+    assert plan.localisation is not None
+    assert plan.presumed is not None
+    chart, hotspots = _mapped(plan, measurements)
+    estimated = localise(plan.presumed, measurements, spans, plan.localisation, known)
+    return Survey(map=chart, hotspots=hotspots, estimated=estimated, found=estimated.fits.present[0])
+
+
+def _mapped(plan: Plan, measurements: Measurements) -> tuple[RadiationMap, Hotspots]:
+    """Map and hotspots.
 
     The map joins detectors of several models by their nominal backgrounds: the exposure of each is multiplied by its
     background over that of the first model, as if all its counts grew with its size alike.
     """
     assert plan.mapping is not None
-    assert plan.localisation is not None
-    assert plan.presumed is not None
     background = jnp.stack([d.background_cps for d in plan.detectors])
     size = jnp.where(background[0] > 0.0, background / jnp.maximum(background[0], 1e-9), 1.0)
     scaled = replace(measurements, exposure_s=measurements.exposure_s * size[measurements.detector])
     chart = interpolate(plan.mapping, scaled)
-    hotspots = extract_hotspots(plan.mapping, chart)
-    estimated = localise(plan.presumed, measurements, spans, plan.localisation, known)
-    return Survey(map=chart, hotspots=hotspots, estimated=estimated, found=estimated.fits.present[0])
+    return chart, extract_hotspots(plan.mapping, chart)
 
 
 def named(

@@ -66,9 +66,8 @@ def roi_rates_and_slopes(
     # of many, all go on as long as any: a line without photons adds nothing, and to leave it out costs more
     count = at_most(-(-jnp.where(asked, count, 0) // together))
 
-    def of(line: dict[str, jax.Array]) -> RoiRates:
-        own: Any = line
-        return _of_line(replace(detector, **own), one, way, position_m, axis, by, given, places)
+    def of(line: dict[str, Any]) -> RoiRates:
+        return _of_line(replace(detector, **line), one, way, position_m, axis, by, given, places)
 
     def add(number: jax.Array, sums: RoiRates) -> RoiRates:
         if together == 1:
