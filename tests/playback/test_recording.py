@@ -79,10 +79,10 @@ def test_written_in_a_second_and_ten_megabytes(site: SiteModel, tmp_path: Path) 
     assert len(site.mesh.triangles) > 30_000
     assert sum(len(v.time_s) for v in record.vehicles) > 4 * 6000
     best = np.inf
-    for k in range(3):  # the best of three: other work on the machine is none of the writer's
-        start = time.perf_counter()
+    for k in range(3):
+        start = time.process_time()  # of all its threads: other work on the machine is none of the writer's
         write_recording(record, site, tmp_path / f"{k}.rrd")
-        best = min(best, time.perf_counter() - start)
+        best = min(best, time.process_time() - start)
     assert best < 1.0
     assert (tmp_path / "0.rrd").stat().st_size < 10e6
 
