@@ -55,6 +55,7 @@ def settle(
     *,
     fresh: bool = False,
     exact: bool = True,
+    fitted: jax.Array | bool = True,
 ) -> Settled:
     """Fit all unknowns for a source of ``nuclide`` at the place that ``ways`` lead from.
 
@@ -69,8 +70,12 @@ def settle(
             ``start`` (static).
         exact: whether the rates are computed again with the lengths that were fitted, and a few further steps done;
             else they are extrapolated (`lengthened`; static).
+        fitted: [] bool; where it is False the rates are computed and no step is done.
     """
     passes = [steps, MORE_STEPS] if exact and problem.uncertain else [steps]
+    # a loop of known length, unless something else is asked
+    count = len(passes) if fitted is True else jnp.where(fitted, len(passes), 1)
+    steps_of = jnp.where(fitted, jnp.array(passes), 0)
 
     def linear(u: Unknowns, source: Rates) -> Linearised:
         return linearised(problem, source, others, ways.position_m, u)
@@ -85,10 +90,10 @@ def settle(
         source = rates(problem, ways, nuclide, u.lengths)
         if fresh:
             u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, ways.position_m, u), lambda: u)
-        return jax.lax.fori_loop(0, jnp.array(passes)[number], step, (u, source))
+        return jax.lax.fori_loop(0, steps_of[number], step, (u, source))
 
     # a loop, so that what a pass does is compiled once
-    u, source = jax.lax.fori_loop(0, len(passes), pass_, (start, silent(problem)))
+    u, source = jax.lax.fori_loop(0, count, pass_, (start, silent(problem)))
     return _settled(problem, linear(u, source), u, ways, source)
 
 

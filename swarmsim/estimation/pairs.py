@@ -22,7 +22,7 @@ import numpy as np
 
 from swarmsim.device import each, for_those, repeat_while
 from swarmsim.estimation.fit import FLAT
-from swarmsim.estimation.forward import Problem, rates, silent, variance_of, ways_from
+from swarmsim.estimation.forward import Problem, silent, variance_of
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.normal_equations import LOOSE, Others, joint_equations, linearised, normal_equations
 from swarmsim.estimation.search import FARTHEST, GOLDEN_ANGLE_RAD, TOGETHER, Tried, attempt, bounds, mirrored_place
@@ -274,15 +274,22 @@ def _as_two(
     """
     s, (low, high) = state.sources, bounds(problem)
     place = jnp.clip(s.place[k] + offset_m, low, high)
-    ways = ways_from(problem, place[0])
-    found = rates(problem, ways, s.nuclide[k], state.unknowns.lengths, slopes=False)
-    first = Others(
-        counts=share * s.activity_bq[k] * found.counts, variance=variance_of(problem, ways.position_m) + found.edge
-    )
-    added = Others(
-        counts=state.added.counts.at[k].set(first.counts), variance=state.added.variance.at[k].set(first.variance)
-    )
-    second = attempt(problem, nuclide, added, state.unknowns, place[1])
+    nuclides = jnp.stack([s.nuclide[k], nuclide])
+
+    def next_(number: jax.Array | int, carry: tuple[Others, Tried]) -> tuple[Others, Tried]:
+        added, _ = carry
+        tried = attempt(problem, nuclides[number], added, state.unknowns, place[number], fitted=number == 1)
+        found = tried.fit.rates
+        counts = added.counts.at[k].set(share * s.activity_bq[k] * found.counts)
+        variance = variance_of(problem, position_of(problem.site, place[number])) + found.edge
+        first = Others(counts=counts, variance=added.variance.at[k].set(variance))
+        return jax.tree.map(partial(jnp.where, number == 0), first, added), tried
+
+    shape = jax.eval_shape(lambda: attempt(problem, nuclide, state.added, state.unknowns, place[1]))
+    nothing: Tried = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape)
+    # a loop, so that what lies between a place and the windows is compiled once
+    added, second = jax.lax.fori_loop(0, 2, next_, (state.added, nothing))
+    first = Others(counts=added.counts[k], variance=added.variance[k])
     above = jnp.square(place[0, 2] - problem.height_m) - jnp.square(s.place[k, 2] - problem.height_m)
     return Two(
         number=k.astype(jnp.int32),

@@ -60,11 +60,21 @@ class Candidates:
     apart: jax.Array  # [] bool, whether the best of each part is fitted, or the best of all
 
 
-def attempt(problem: Problem, nuclide: jax.Array, others: Others, u: Unknowns, place: jax.Array) -> Tried:
-    """The fit at a place [3] from the unknowns ``u``: from the levels and the others' factors alone."""
+def attempt(
+    problem: Problem,
+    nuclide: jax.Array,
+    others: Others,
+    u: Unknowns,
+    place: jax.Array,
+    fitted: jax.Array | bool = True,
+) -> Tried:
+    """The fit at a place [3] from the unknowns ``u``: from the levels and the others' factors alone.
+
+    Where ``fitted`` [] is False nothing is, and rates are those with the lengths of ``u``.
+    """
     # lengths that a wrong place asked for would make others look wrong
-    u = replace(u, lengths=jnp.zeros_like(u.lengths))
-    fit = settle(problem, ways_from(problem, place), nuclide, others, u, STEPS, fresh=True)
+    u = replace(u, lengths=jnp.where(fitted, 0.0, u.lengths))
+    fit = settle(problem, ways_from(problem, place), nuclide, others, u, STEPS, fresh=True, fitted=fitted)
     return Tried(place=place, nuclide=nuclide, fit=fit)
 
 

@@ -14,7 +14,7 @@ from swarmsim.config.radiation import DetectorMount, Nuclide
 from swarmsim.pytree import on_device, pytree, static
 from swarmsim.radiation import scattering
 from swarmsim.radiation.attenuation import linear_attenuation
-from swarmsim.radiation.cylinder import NEAR_TABLES, fit_effective_area, near_tables
+from swarmsim.radiation.cylinder import fit_effective_area, near_parts
 from swarmsim.radiation.ground import from_ground
 from swarmsim.radiation.library import Library
 from swarmsim.radiation.lines import (
@@ -71,7 +71,7 @@ class Detector:
     sample_period_s: jax.Array  # [] real time of one measurement, dead time included
     yields: jax.Array  # [N, L] photons per decay
     effective_area_m2: jax.Array  # [N, L, 5] coefficients of cylinder.direction_basis, housing and threshold included
-    near: jax.Array  # [NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS] of cylinder.near_ratio
+    near: jax.Array  # [NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS] of cylinder.near_parts
     near_share: jax.Array  # [N, L, NEAR_TABLES] weights of the tables for each line
     attenuation_1_m: jax.Array  # [N, L, M]
     surrounds: jax.Array  # [M] 1 for materials that are no walls (air, leaves), else 0
@@ -131,7 +131,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
     mu = np.broadcast_to(counting.attenuation_1_m(energy), energy.shape)
     area = fit_effective_area(radius, length, mu.ravel()).reshape(*energy.shape, 5)
     area = area * (counting.counts(energy) * counting.through_housing(energy))[..., None]
-    nodes = np.geomspace(mu.min(), max(mu.max(), 1.01 * mu.min()), NEAR_TABLES)
+    near, near_share = near_parts(radius, length, mu)
     axis = np.asarray(mount.axis) / np.linalg.norm(mount.axis)
     counted = (lambda e: _mean_area(counting, e, (radius, length))) if kind == "physical" else None
     attenuation, coefficients, bins = _transport(library, energy, counted)
@@ -150,8 +150,8 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         sample_period_s=f32(spec.sample_period_s),
         yields=f32(yields),
         effective_area_m2=f32(area),
-        near=f32(near_tables(radius, length, nodes)),
-        near_share=f32(_shares(np.log(mu), np.log(nodes))),
+        near=f32(near),
+        near_share=f32(near_share),
         attenuation_1_m=f32(attenuation),
         surrounds=f32(surrounding(library)),
         scatter_1_m=f32(coefficients),
@@ -214,12 +214,6 @@ def counting_of(spec: DetectorSpec, library: Library, response: Response | None,
         lambda e: np.exp(np.interp(np.log(e), points, values)),
         lambda e: np.exp(-linear_attenuation(housing, e) * thickness),
     )
-
-
-def _shares(value: Floats, nodes: Floats) -> Floats:
-    """Weights [..., k] of linear interpolation between ``nodes`` [k], constant beyond them."""
-    place = np.interp(value, nodes, np.arange(len(nodes), dtype=float))
-    return np.asarray(np.maximum(1.0 - np.abs(place[..., None] - np.arange(len(nodes))), 0.0))
 
 
 def surrounding(library: Library) -> Floats:

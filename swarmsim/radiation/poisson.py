@@ -36,7 +36,8 @@ def _inverted(u: jax.Array, mean: jax.Array) -> jax.Array:
     k = np.arange(_TERMS, dtype=np.float32)
     logarithm = k * jnp.log(jnp.maximum(mean, 1e-30)) - mean - _LOG_FACTORIAL
     below = jnp.cumsum(jnp.exp(logarithm))
-    return jnp.sum(u >= below, dtype=jnp.float32)
+    # of the sum as rounded, which a uniform number next to 1 would exceed: no number is the last of all terms then
+    return jnp.sum(u * below[-1] >= below, dtype=jnp.float32)
 
 
 def _transformed(uv: jax.Array, mean: jax.Array) -> jax.Array:

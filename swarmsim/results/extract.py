@@ -68,7 +68,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     chart = None if conclusion is None else _map(simulation, conclusion.survey)
     verdict = None
     if conclusion is not None and chart is not None:
-        verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, spectrum)
+        verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, spectrum, end)
     events = sorted(_events(simulation, end, phases), key=lambda event: event.time_s)
     return MissionRecord(
         name=simulation.scenario.mission.name,
@@ -332,6 +332,7 @@ def _verdict(
     aerial: tuple[Estimate, ...],
     final: tuple[Estimate, ...],
     spectrum: Spectrum | None,
+    end: MissionState,
 ) -> Verdict:
     """Status of the mission's answer."""
     estimated, detectors, presumed = conclusion.estimated, simulation.plan.detectors, simulation.plan.presumed
@@ -343,6 +344,8 @@ def _verdict(
     of_vehicle = used[samples.vehicle]
     highest = np.array([highest_rate(detector) for detector in detectors])
     background = np.array([float(detector.background_cps) for detector in detectors])
+    shown = spectrum is not None and spectrum.nuclide != UNNAMED[NONE] and not _no_way(simulation, end)
+    suggested = spectrum.nuclide if spectrum is not None and shown else ""
     fit = Fit(
         misfit=float(estimated.misfit), chi_squared=float(estimated.chi_squared), strain=float(estimated.strain)
     )  # fmt: skip
@@ -359,6 +362,7 @@ def _verdict(
         (float(np.exp(presumed.log_activity)) * 1e-6, float(presumed.log_activity_std)),
         gamma_constants(simulation, final),
         {} if spectrum is None else spectrum.scores,
+        suggested,
     )
 
 

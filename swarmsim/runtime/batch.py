@@ -338,6 +338,8 @@ def _in_turn(together: int, apply: Callable[..., Any], carried: Any, own: Any, c
         made = jax.lax.map(evaluate, places.reshape(-1, size))
         # -1 would say nothing of what has no size, such as the thickness of walls that are known
         return jax.tree.map(lambda x: x.reshape(len(places), *x.shape[2:])[:missions], made)
+    if missions == 1:
+        return jax.lax.cond(only[0], lambda: _alone(apply, carried, own, common), lambda: carried)
     if size == missions:
         return jax.lax.cond(jnp.any(only), lambda: _chosen(only, evaluate(places), carried), lambda: carried)
     asked = jnp.sum(only)

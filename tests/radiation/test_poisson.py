@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from swarmsim.radiation.poisson import INVERTED_BELOW, poisson
+from swarmsim.radiation.poisson import INVERTED_BELOW, _inverted, poisson
 
 N = 100_000
 draw = jax.jit(lambda mean: jax.vmap(partial(poisson, mean=mean))(jax.random.split(jax.random.key(11), N)))
@@ -37,3 +37,12 @@ def test_large_means_have_their_moments(mean):
 def test_nothing_comes_of_nothing_and_no_number_of_no_mean():
     np.testing.assert_array_equal(draw(jnp.float32(0.0)), 0.0)
     assert np.isnan(np.asarray(poisson(jax.random.key(0), jnp.float32(np.nan))))
+
+
+def test_the_largest_uniform_number_gives_what_is_that_rare():
+    """The sum of the terms as rounded may stay below it: no number of counts follows from that."""
+    means = np.geomspace(1e-3, INVERTED_BELOW, 400)
+    largest = jnp.float32(1.0 - 2.0**-23)
+    drawn = np.asarray(jax.vmap(lambda mean: _inverted(largest, mean))(jnp.asarray(means, jnp.float32)))
+    assert np.all(drawn <= stats.poisson.isf(1e-9, means))
+    assert np.all(drawn >= stats.poisson.isf(1e-5, means))

@@ -41,6 +41,7 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
 def verdict(
     samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0,
     at_1_m=MappingProxyType({}), presumed=(100.0, 10.0), identified=MappingProxyType({}),
+    suggested="",
 ):  # fmt: skip
     samples = survey() if samples is None else samples
     n = len(samples.counts)
@@ -48,7 +49,7 @@ def verdict(
     return assess(
         samples, chart(hotspots, rate), limits, np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
-        (presumed[0], float(np.log(presumed[1]))), at_1_m, identified,
+        (presumed[0], float(np.log(presumed[1]))), at_1_m, identified, suggested,
     )  # fmt: skip
 
 
@@ -85,6 +86,17 @@ def test_different_nuclides_are_compared_by_what_they_add() -> None:
     even = {"Co-60": GammaConstant(0.35, 0.30), "Am-241": GammaConstant(0.003, 0.0025)}
     pair = (estimate(activity=5.0), estimate(20.0, activity=600.0, nuclide="Am-241"))
     assert verdict(final=pair, at_1_m=even, aerial=(estimate(1.0, activity=5.0),)).status == "located"
+
+
+def test_a_spectrum_of_another_nuclide_contradicts_the_surest_source() -> None:
+    assert verdict(suggested="Co-60").status == "located"
+    other = verdict(suggested="Cs-137")
+    assert (other.status, other.reasons) == ("ambiguous", ("the spectrum taken near the Co-60 source is of Cs-137",))
+    stranger = verdict(suggested="unknown")
+    assert stranger.reasons == ("the spectrum taken near the Co-60 source is of none in the library",)
+    both = (estimate(), estimate(40.0, nuclide="Cs-137"))
+    assert verdict(final=both, suggested="Cs-137").status == "ambiguous"
+    assert verdict(found=False, hotspots=(), suggested="Cs-137").status == "none"
 
 
 def test_two_nuclides_in_one_place_are_believed_where_the_spectrum_shows_both() -> None:
