@@ -92,8 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"{error}\n\nSee 'swarmsim --help' and 'swarmsim COMMAND --help'.\n")
         return EXIT_INPUT
     except InputError as error:
-        sys.stderr.write(f"{describe(error)}\n")
-        return EXIT_INPUT
+        _told(f"{describe(error)}\n")
+        return _ended(EXIT_INPUT, arguments)
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
@@ -112,13 +112,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif isinstance(stop, HungUp):
             code, by = EXIT_HUNG_UP, "by SIGHUP"
         _told(f"\nstopped {by}: nothing unfinished was left behind\n")
-        if arguments is None:
-            # the interpreter would wait for what another thread still compiles or computes, which can take minutes
-            with contextlib.suppress(OSError):
-                sys.stdout.flush()
-            os._exit(code)
-        return code
+        return _ended(code, arguments)
     return 0
+
+
+def _ended(code: int, arguments: Sequence[str] | None) -> int:
+    """The exit code; the process ends with it where another thread still compiles or computes.
+
+    The interpreter would wait for that, which can take minutes.
+    """
+    others = [one for one in threading.enumerate() if one is not threading.current_thread() and not one.daemon]
+    if arguments is None and (others or code != EXIT_INPUT):
+        with contextlib.suppress(OSError):
+            sys.stdout.flush()
+        os._exit(code)
+    return code
 
 
 def describe(error: InputError) -> str:

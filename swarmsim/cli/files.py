@@ -61,6 +61,7 @@ def check_file(path: Path) -> tuple[str, list[str]]:
         from swarmsim.config.site_checks import check_site
 
         scenario = load_scenario(path)
+        warnings = scenario.changes()
         if scenario.family:
             from swarmsim.runtime.run import build
 
@@ -68,6 +69,7 @@ def check_file(path: Path) -> tuple[str, list[str]]:
             varied = ", ".join(dict.fromkeys(v.key for v in scenario.family))
             return f"mission, a family that varies {varied}", warnings
         raise_if_any(check_site(scenario))
+        _check_policies(scenario)
     elif kind == "sites":
         load_named(kind, path)
         from swarmsim.site import load_site
@@ -80,6 +82,21 @@ def check_file(path: Path) -> tuple[str, list[str]]:
     else:
         load_named(kind, path)
     return kind.removesuffix("s"), warnings
+
+
+def _check_policies(scenario: Any) -> None:
+    """Begin the mission of users' policies without computing anything. Raises `InputError` where one of them fails."""
+    from swarmsim.policies.registry import is_shipped
+
+    if all(is_shipped(phase.policy) for phase in scenario.mission.phases):
+        return
+    import jax
+
+    from swarmsim.missions.begin import begin_mission
+    from swarmsim.runtime.run import build
+
+    simulation = build(scenario)
+    jax.eval_shape(begin_mission, jax.random.key(0), simulation.world, simulation.plan)
 
 
 def _check_autopilot(path: Path) -> str:

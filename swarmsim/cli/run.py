@@ -1,6 +1,8 @@
 """What ``swarmsim run`` does."""
 
 import json
+import shlex
+import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -60,6 +62,8 @@ def run_scenario(
         raise InputError.of(
             "the seeds of the batch grow too large", given=f"the last is {last_seed}", allowed="less than 2147483648"
         )
+    for sentence in scenario.changes():
+        sys.stderr.write(f"warning: {sentence}\n")
     folder = out if out is not None else Path("runs") / scenario.mission.name
 
     from swarmsim.results.out_folder import check_out
@@ -82,7 +86,7 @@ def run_scenario(
         console.print(summary_table(summary, scenario.mission.name))
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
     if (folder / RECORDING).is_file():
-        console.print(f"Watch:   swarmsim view {folder}", highlight=False, soft_wrap=True)
+        console.print(f"Watch:   swarmsim view {shlex.quote(str(folder))}", highlight=False, soft_wrap=True)
     from swarmsim.results.status import CERTAIN
 
     statuses = summary.get("statuses", {summary.get("status"): 1})

@@ -52,7 +52,7 @@ def _with_body(vehicle: Any, path: Path, document: Document) -> Any:
     """The vehicle with its body's file, written relative to the folder of the vehicle's file, made absolute."""
     if vehicle.body is None:
         return vehicle
-    file = files.resolved(path.parent) / vehicle.body.file
+    file = files.resolved(files.resolved(path.parent) / vehicle.body.file)
     if not files.is_file(file):
         place = ("body", "file")
         raise InputError([document.problem(place, "there is no such file", given=vehicle.body.file)])

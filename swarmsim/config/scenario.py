@@ -31,6 +31,13 @@ from swarmsim.versions import package_versions
 
 _VERSIONED = ("jax", "mujoco", "mujoco-mjx", "numpy")
 
+_FILES = {
+    "site_sha256": "the site",
+    "policy_sha256": "the file of the policy {}",
+    "body_sha256": "the body file of {}",
+}
+"""Hashes among the versions, and what they are of."""
+
 
 @dataclass(frozen=True)
 class Scenario:
@@ -69,8 +76,9 @@ class Scenario:
         """The scenario fully resolved: every default, setting and definition of what it names written out.
 
         `load_scenario` reads it back to the same mission, wherever it lies: the file of a user's policy is named by its
-        absolute path where the working folder does not lead to it. The site stays a name; the hashes of its files and
-        of users' policies are among the ``versions`` (``site_sha256``, ``policy_sha256.<policy>``).
+        absolute path where the working folder does not lead to it. The site stays a name; the hashes of its files, of
+        users' policies and of vehicles' body files are among the ``versions`` (``site_sha256``,
+        ``policy_sha256.<policy>``, ``body_sha256.<vehicle>``).
         """
         data = self.mission.model_dump(mode="json", exclude_none=True)
         for phase in data["phases"]:
@@ -92,7 +100,7 @@ class Scenario:
         return dump_yaml(data)
 
     def versions(self) -> dict[str, str]:
-        """What this scenario runs with: Python, the packages that decide results, hashes of site and policy files."""
+        """What this scenario runs with: Python, packages that decide results, hashes of site, policy and body files."""
         from swarmsim.policies import registry
 
         digest = hashlib.sha256(self.site_file.read_bytes())
@@ -103,7 +111,21 @@ class Scenario:
         for policy in dict.fromkeys(phase.policy for phase in self.mission.phases):
             if sha256 := registry.digest(policy, self.mission_file):
                 found[f"policy_sha256.{_found_from_anywhere(policy, self.mission_file)}"] = sha256
+        for vehicle in self.vehicles:
+            if vehicle.body is not None:
+                body = Path(vehicle.body.file).read_bytes()
+                found[f"body_sha256.{vehicle.name}"] = hashlib.sha256(body).hexdigest()
         return found
+
+    def changes(self) -> list[str]:
+        """Sentences on files that are no longer those that a fully resolved scenario was written with."""
+        wrote, have = self.mission.versions, self.versions()
+        return [
+            f"{_FILES[key.partition('.')[0]].format(key.partition('.')[2])} is no longer what it was when the scenario "
+            f"was written (versions.{key}): it flies otherwise"
+            for key, sha256 in wrote.items()
+            if key.partition(".")[0] in _FILES and have.get(key, sha256) != sha256
+        ]
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from swarmsim.estimation import LocalisationParams, MappingParams, Presumed
+from swarmsim.missions.asked import Asked
 from swarmsim.policies import registry
 from swarmsim.pytree import pytree, static
 from swarmsim.radiation.detector import Detector
@@ -27,8 +28,9 @@ class PolicyReference:
 
     @property
     def object(self) -> Any:
-        """The policy, or the planner."""
-        return registry.find(self.reference)
+        """The policy, or the planner; a user's says what fails in it."""
+        policy = registry.find(self.reference)
+        return policy if registry.is_shipped(self.reference) else Asked(self.reference, policy)
 
 
 @jax.tree_util.register_pytree_node_class

@@ -20,6 +20,7 @@ Answer = TypeVar("Answer")
 FOUND = ("source", "hotspot")
 """What a policy can need the mission to find."""
 _SHOWN = 60
+_NOT_OWN = ("/site-packages/", str(Path(__file__).parents[1]))  # of a traceback: where a user's mistake comes to light
 _WORDS = {
     "needs": ("needs", "thing that a mission finds"),
     "senses": ("senses", "kind of sensor"),
@@ -36,10 +37,12 @@ def ask(reference: str, what: str, question: Callable[[], Answer]) -> Answer:
     except (Exception, SystemExit) as error:
         if stop := stop_of(error):
             raise stop from None
-        frames = traceback.extract_tb(error.__traceback__)
-        where = f"{shown_path(Path(frames[-1].filename))}:{frames[-1].lineno}: " if len(frames) > 1 else ""
+        frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is here
+        own = [frame for frame in frames if not any(part in frame.filename for part in _NOT_OWN)] or frames
+        where = f"{shown_path(Path(own[-1].filename))}:{own[-1].lineno}: " if own else ""
+        words = str(error).strip().partition("\n")[0]  # JAX adds paragraphs
         raise InputError.of(
-            f"{what} of the policy '{reference}' fails: {where}{type(error).__name__}: {error}",
+            f"{what} of the policy '{reference}' fails: {where}{type(error).__name__}: {words}",
             given=reference,
             suggestion="mend the policy's code",
         ) from error

@@ -102,7 +102,7 @@ def find(reference: str, near: Path | None = None) -> Any:
 
 def settings_model(reference: str, near: Path | None = None) -> type[PolicySettings]:
     """The model of a policy's settings; `PolicySettings` itself for a policy that has none. Raises as `find` does."""
-    if _is_shipped(reference):
+    if is_shipped(reference):
         return SETTINGS[reference]
     policy = find(reference, near)
     model = ask(reference, "Settings", lambda: getattr(policy, "Settings", None))
@@ -120,7 +120,7 @@ def settings_model(reference: str, near: Path | None = None) -> type[PolicySetti
 def vehicle_kinds(reference: str, near: Path | None = None) -> tuple[str, ...]:
     """Kinds of vehicle that a policy can command: its own ``vehicles``, or those of its settings."""
     model = settings_model(reference, near)
-    if _is_shipped(reference):
+    if is_shipped(reference):
         return model.vehicles
     policy = find(reference, near)
     own = ask(reference, "vehicles", lambda: getattr(policy, "vehicles", None))
@@ -135,7 +135,7 @@ def senses(reference: str, near: Path | None = None) -> tuple[str, ...]:
 
     Raises as `find` does, and where it names what is no kind of sensor.
     """
-    if _is_shipped(reference):
+    if is_shipped(reference):
         return ()
     policy = find(reference, near)
     given = ask(reference, "senses", lambda: getattr(policy, "senses", ()))
@@ -144,7 +144,7 @@ def senses(reference: str, near: Path | None = None) -> tuple[str, ...]:
 
 def digest(reference: str, near: Path | None = None) -> str:
     """SHA-256 of the file that a user's policy stands in; empty for this package's, and where there is no file."""
-    if _is_shipped(reference):
+    if is_shipped(reference):
         return ""
     policy = find(reference, near)
     path = policy_file(reference, near)
@@ -164,7 +164,7 @@ def policy_file(reference: str, near: Path | None = None) -> Path | None:
     return None
 
 
-def _is_shipped(reference: str) -> bool:
+def is_shipped(reference: str) -> bool:
     """Whether a name is that of a policy of this package, told without importing JAX."""
     return reference in SETTINGS and (
         reference not in _registered or type(_registered[reference]).__module__.startswith(f"{_PACKAGE}.")

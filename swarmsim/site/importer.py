@@ -33,6 +33,7 @@ POINTS_MAX = 200_000_000
 FLUSH_M = 0.02  # what rises no further above the ground does not stand on it
 COARSE_M = 0.3  # cells of the raster of clearances that a user is told of
 BARE_SHARE = 0.05  # of a site that is traversable: below it there is hardly any ground
+GROUND_SHARE = 0.4  # of a model's extent that is ground, below which the user is asked whether it has one
 FAR_BELOW_M = 100.0  # level ground this far below or above a model is not under it
 PLANE = "level ground"  # name of the part that `SiteSpec.plane` adds
 
@@ -196,6 +197,11 @@ def _warnings(report: dict[str, Any], ground: Ground, inside: Mask) -> list[str]
         found.append(
             "hardly any of it is open ground: if the model is a building without its surroundings, plane (--plane 20) "
             "lays level ground 20 m around it"
+        )
+    elif inside.mean() < GROUND_SHARE and report["parts"]:
+        found.append(
+            f"there is ground under {inside.mean():.0%} of the model's extent only, and what lies beside it is outside "
+            "the site: if nothing in the model is ground, plane (--plane 20) lays level ground under and around it"
         )
     return found
 

@@ -208,6 +208,18 @@ def test_a_scenario_with_a_policy_of_the_users(project: Path) -> None:
     assert load_scenario(project, [phase_of("{}", "climb.py:Plan")]).settings[0] == PolicySettings()
 
 
+def test_a_scenario_says_that_what_it_was_written_with_has_changed(project: Path) -> None:
+    scenario = load_scenario(project, [phase_of("{altitude_m: 12}")])
+    assert scenario.changes() == []
+    written = project.parent / "written.yaml"
+    written.write_text(scenario.to_yaml())
+    assert load_scenario(written).changes() == []
+    file = Path("climb.py")
+    file.write_text(CLIMB.replace("period_s = 0.5", "period_s = 0.25"))
+    (told,) = load_scenario(written).changes()
+    assert "the file of the policy climb.py:climb is no longer what it was" in told
+
+
 @pytest.mark.parametrize(
     ("override", "fragment"),
     [

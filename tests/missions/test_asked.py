@@ -1,0 +1,86 @@
+"""Policies of users that fail, or answer what cannot be, are told as wrong input with the file and the line."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import pytest
+
+from swarmsim.config.errors import InputError
+from swarmsim.control.commands import DriveCommand, fly_velocity
+from swarmsim.missions.asked import Asked
+from swarmsim.vehicles.multirotor import MultirotorParams
+
+HERE = Path(__file__).name
+ROVER = SimpleNamespace(params=None)
+
+
+class Policy:
+    """What a user's file holds; ``answer`` is what `act` gives."""
+
+    period_s = 0.5
+
+    def __init__(self, answer):
+        self.answer = answer
+
+    def start(self, task, key):
+        raise KeyError("boom")
+
+    def act(self, task, memory, view, key):
+        return self.answer(memory) if callable(self.answer) else self.answer
+
+
+def uav():
+    params = object.__new__(MultirotorParams)
+    object.__setattr__(params, "rotor_spin", jnp.ones(4))
+    return SimpleNamespace(params=params)
+
+
+def test_attributes_are_the_policys_own() -> None:
+    asked = Asked("my.py:P", Policy(None))
+    assert asked.period_s == 0.5
+    assert not hasattr(asked, "plan")
+    assert not hasattr(asked, "done")
+
+
+def test_a_method_that_fails_says_where() -> None:
+    with pytest.raises(InputError, match=rf"start\(\) of the policy 'my.py:P' fails: .*{HERE}:\d+: KeyError: 'boom'"):
+        Asked("my.py:P", Policy(None)).start(None, None)
+
+
+def test_what_a_branch_on_a_traced_value_says_is_one_line() -> None:
+    import jax
+
+    def act(memory):
+        return (memory if memory > 0.0 else -memory), fly_velocity(jnp.zeros(3))
+
+    with pytest.raises(InputError) as told:
+        jax.jit(lambda m: Asked("my.py:P", Policy(act)).act(uav(), m, None, None)[0])(jnp.zeros(()))
+    (problem,) = told.value.problems
+    assert f"{HERE}:" in problem.message
+    assert "TracerBoolConversionError" in problem.message
+    assert "\n" not in problem.message
+
+
+@pytest.mark.parametrize(
+    ("task", "answer", "fragment"),
+    [
+        (uav, 3, "must give two values"),
+        (uav, lambda m: (jnp.zeros(3), fly_velocity(jnp.zeros(3))), "must give a memory of the shape and type"),
+        (uav, lambda m: (jnp.zeros(2, jnp.int32), fly_velocity(jnp.zeros(3))), "must give a memory of the shape"),
+        (uav, lambda m: ((m, m), fly_velocity(jnp.zeros(3))), "must give a memory of the shape and type"),
+        (uav, lambda m: (m, 3), "gives no command: a multirotor is commanded by one of PositionCommand"),
+        (uav, lambda m: (m, fly_velocity(jnp.zeros(2))), "has the shape"),
+        (lambda: ROVER, lambda m: (m, fly_velocity(jnp.zeros(3))), "a skid-steer rover is commanded by one of"),
+    ],
+)
+def test_what_act_gives_is_looked_at(task, answer, fragment) -> None:
+    with pytest.raises(InputError, match=fragment):
+        Asked("my.py:P", Policy(answer)).act(task(), jnp.zeros(2), None, None)
+
+
+def test_what_is_right_passes() -> None:
+    drive = DriveCommand(speed_m_s=jnp.zeros(()), yaw_rate_rad_s=jnp.zeros(()))
+    memory, command = Asked("my.py:P", Policy(lambda m: (m + 1.0, drive))).act(ROVER, jnp.zeros(2), None, None)
+    assert command is drive
+    assert memory.tolist() == [1.0, 1.0]
