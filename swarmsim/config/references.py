@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from swarmsim.config import files
 from swarmsim.config.allowed import item
 from swarmsim.config.documents import Document, Place
-from swarmsim.config.errors import PROBLEMS_MAX, Problem, raise_if_any
+from swarmsim.config.errors import PROBLEMS_MAX, InputError, Problem, raise_if_any
 from swarmsim.config.load import load_named, read_document
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.radiation import Detector
@@ -119,6 +119,13 @@ def sensors_twice(vehicle: Multirotor | SkidSteer, sensors: Mapping[str, AnySens
     return told
 
 
+def _of_body(document: Document, problem: Problem) -> Problem:
+    """What is wrong with a body's file, told where the vehicle's file names it."""
+    hint = problem.suggestion or "mend the body's file, or name another one"
+    place = ("body", "file")
+    return document.problem(place, problem.message, given=problem.file, allowed=problem.allowed, suggestion=hint)
+
+
 def load_vehicle(path: Path) -> Multirotor | SkidSteer:
     """The vehicle of a file; raises `InputError` with what is wrong with it and with the parts that it carries."""
     vehicle: Multirotor | SkidSteer = load_named("vehicles", path)
@@ -133,10 +140,14 @@ def load_vehicle(path: Path) -> Multirotor | SkidSteer:
     if vehicle.body is not None:
         from swarmsim.vehicles.bodies import read_rover_body, with_file_body
 
-        if isinstance(vehicle, SkidSteer):
-            read_rover_body(vehicle.body)
-        else:
-            with_file_body(vehicle)
+        try:
+            if isinstance(vehicle, SkidSteer):
+                read_rover_body(vehicle.body)
+            else:
+                with_file_body(vehicle)
+        except InputError as error:
+            problems = [_of_body(document, problem) for problem in error.problems]
+            raise InputError(problems) from error
     return vehicle
 
 

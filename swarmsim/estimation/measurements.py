@@ -17,7 +17,7 @@ class Measurements:
     travel_m: jax.Array  # [n, 3] m, way of the crystal during the interval, with its middle at position_m; world
     axis: jax.Array  # [n, 3] unit vector along the crystal's axis, world
     counts: jax.Array  # [n] counts in the interval
-    exposure_s: jax.Array  # [n] s, live time that the counts stand for
+    exposure_s: jax.Array  # [n] s, real time that the counts stand for, dead time included
     valid: jax.Array  # [n] bool
     detector: jax.Array  # [n] int32, index into the tuple of detector models
     rois: jax.Array | None = None  # [n, R] the counts by region of interest

@@ -128,7 +128,7 @@ class Simulation:
         self.clock.reset()
         layout = layout_for(self.world.vehicles * batch.missions // batch.shards)
         draws = self._given(self.draw(numbers), values or {})
-        worlds, plans = self._spread(batch, draws, layout)
+        worlds, plans = self._spread(batch, draws, layout, tuple(values or ()))
         run = MissionRun(batch, worlds, plans, self.plan, tell)
         keys = batch.put(randomness.mission_keys(padded))
         end, segments = run.fly(keys)
@@ -166,7 +166,7 @@ class Simulation:
         named = {canonical(scenario.document, path, scenario.mission_file): each for path, each in values.items()}
         return with_given(draws, named)
 
-    def _drawn(self, seed: int, row: Mapping[str, Any]) -> tuple[World, Plan]:
+    def _drawn(self, seed: int, row: Mapping[str, Any], given: Sequence[str] = ()) -> tuple[World, Plan]:
         """World and plan of a mission with these values; raises `InputError`, which tells the seed, for wrong ones."""
         scenario = self.scenario
         if not row:
@@ -179,14 +179,16 @@ class Simulation:
         except InputError as error:
             if not self.scenario.family:
                 raise
-            raise InputError(self._drawn_so(problem, seed) for problem in error.problems) from None
+            raise InputError(self._drawn_so(problem, seed, given) for problem in error.problems) from None
 
-    def _drawn_so(self, problem: Problem, seed: int) -> Problem:
-        """What is wrong with the mission of a seed; told where the distribution stands that drew it."""
+    def _drawn_so(self, problem: Problem, seed: int, given: Sequence[str]) -> Problem:
+        """What is wrong with the mission of a seed; told where the distribution stands that drew it, or as given."""
         told = replace(problem, message=f"{problem.message} (in the mission of seed {seed})")
         if problem.file != ORIGIN:
             return told
         path = f"{problem.path}."
+        if any(path.startswith(f"{own}.") or f"{own}.".startswith(path) for own in given):
+            return replace(told, file="values")
         for varied in self.scenario.family:
             if path.startswith(f"{varied.path}.") or f"{varied.path}.".startswith(path):
                 place = ("vary", varied.key, varied.distribution.kind)
@@ -195,8 +197,10 @@ class Simulation:
                 return self.scenario.problem(place, message, **hints)
         return told
 
-    def _spread(self, batch: Batch, draws: Draws, layout: Layout) -> tuple[Spread, Spread]:
-        """World and plan of every mission."""
+    def _spread(
+        self, batch: Batch, draws: Draws, layout: Layout, given: Sequence[str] = ()
+    ) -> tuple[Spread, Spread]:  # fmt: skip
+        """World and plan of every mission; the values of the paths ``given`` were not drawn."""
         values = draws.values
         if not values:
             return batch.spread([replace(self.world, layout=layout)]), batch.spread([self.plan])
@@ -205,7 +209,7 @@ class Simulation:
         for seed, row in zip(draws.seeds, zip(*values.values(), strict=True), strict=True):
             key = tuple(map(repr, row))
             if key not in built:
-                built[key] = self._drawn(seed, dict(zip(values, row, strict=True)))
+                built[key] = self._drawn(seed, dict(zip(values, row, strict=True)), given)
                 self._check_alike(built[key], values)
             pairs.append(built[key])
         worlds = [replace(world, layout=layout) for world, _ in pairs]

@@ -65,7 +65,7 @@ def read_body(source: BodyFile) -> FileBody:
     """
     path = Path(source.file)
     if not path.is_file():
-        raise InputError.of(f"there is no body file {path}", file=path)
+        raise InputError.of("there is no such body file", file=path)
     robot = _parse(_urdf_text(path, source.args), path)
     links = tuple(_link(robot, name) for name, link in robot.link_map.items() if link.inertial is not None)
     mass = sum(link.mass_kg for link in links)

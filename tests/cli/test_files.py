@@ -69,7 +69,9 @@ def test_check_tells_faults_of_what_a_file_names(project: Path, capsys: pytest.C
     (configs / "vehicles/body.urdf").write_text("<robot name='r'><link name='a'/></robot>")
     spoil(configs / "materials/aluminium.yaml", "density", "density_kg_m3")
     assert cli.main(["check", "configs/vehicles/orpheus.yaml"]) == 2
-    assert "body.urdf: the body has no mass" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "body.file: the body has no mass" in told
+    assert str(vehicle.name) in told
 
 
 def test_check_cannot_tell_the_kind_of_anything(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

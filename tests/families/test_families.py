@@ -249,6 +249,13 @@ def test_what_are_no_seeds_or_no_values_for_them(standing):
         standing.rollout([3, 4], values=[1.0, 2.0])
 
 
+def test_wrong_values_are_told_as_given_and_not_as_drawn(standing):
+    with pytest.raises(swarmsim.InputError, match=r"^values sources\.0\.nuclide: there is no nuclide 'Zz'"):
+        standing.rollout([3, 4], values={"sources.0.nuclide": ["Co-60", "Zz"]})
+    with pytest.raises(swarmsim.InputError, match=r"^values wind\.speed_m_s: "):
+        standing.rollout([3, 4], values={"wind.speed_m_s": [1.0, -1.0]})
+
+
 def test_values_in_the_stead_of_a_family_make_a_single_scenario(standing):
     row = {path: value for path, (value,) in standing.draw(5).values.items()}
     alone = with_values(standing.scenario, row)

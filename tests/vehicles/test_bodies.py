@@ -84,7 +84,7 @@ def test_a_body_without_mass_is_refused(tmp_path):
 
 
 def test_a_missing_file_is_named():
-    with pytest.raises(InputError, match=r"there is no body file /nowhere/rover\.urdf"):
+    with pytest.raises(InputError, match=r"/nowhere/rover\.urdf: there is no such body file"):
         read_body(BodyFile(file="/nowhere/rover.urdf"))
 
 
