@@ -1,6 +1,7 @@
 """What ``swarmsim check``, ``schema``, ``list``, ``init`` and ``import-site`` do."""
 
 import json
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -237,7 +238,7 @@ def copy_configurations(folder: Path) -> None:
         leave_out = shutil.ignore_patterns("*.py", "elements", "__pycache__", ".*")
         shutil.copytree(files.packaged_dir(), copy, ignore=leave_out, dirs_exist_ok=True)
     count = sum(1 for path in target.rglob("*") if path.is_file())
-    go = "" if folder.resolve() == Path.cwd() else f"cd {folder} && "
+    go = "" if folder.resolve() == Path.cwd() else f"cd {shlex.quote(str(folder))} && "
     sys.stdout.write(f"{count} files copied to {target}\nFly the first mission: {go}swarmsim run recon\n")
 
 

@@ -4,19 +4,22 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from swarmsim.cli.run import value_text
 from swarmsim.config.allowed import shape_of
+from swarmsim.config.base import Name
 from swarmsim.config.documents import Document
 from swarmsim.config.errors import InputError
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.site import SiteSpec
+from swarmsim.site.source_files import TIFF_SUFFIXES
 
 WIDTH = 120  # of what is printed where there is no terminal
-OPTIONS = {"name": "--name", "licence": "--licence", "cell_m": "--cell"}
+OPTIONS = {"name": "the folder's name (--out)", "licence": "--licence", "cell_m": "--cell"}
 """Fields of a site that have an option of their own, other than those in `import_site_file`'s ``given``."""
 
 
@@ -25,7 +28,6 @@ def import_site_file(
     out: Path,
     given: dict[str, Any],
     overrides: Sequence[str],
-    name: str | None,
     cell_m: float | None,
     licence: str | None,
     guess: bool,
@@ -43,6 +45,11 @@ def import_site_file(
             given=str(out),
             suggestion="choose another folder, or replace the site with --force",
         )
+    _check_name(out)
+    if given.get("height_unit_m") is not None and file.suffix.lower() not in TIFF_SUFFIXES:
+        raise InputError.of(
+            "is of elevation models only", path="--height-unit", given=file.name, suggestion="use --unit"
+        )
     document = Document({key: value for key, value in given.items() if value is not None})
     apply_overrides(document, overrides, shape_of(SiteSpec))
     for field, option in OPTIONS.items():
@@ -52,7 +59,7 @@ def import_site_file(
     from swarmsim.site import ImportOptions, import_site
 
     options = ImportOptions(
-        name=name, cell_m=cell_m, fields=document.data, overwrite=force, licence=licence or ImportOptions.licence,
+        cell_m=cell_m, fields=document.data, overwrite=force, licence=licence or ImportOptions.licence,
         guess=guess,
     )  # fmt: skip
     model = import_site(file, out, options)
@@ -68,6 +75,20 @@ def import_site_file(
     console.print(f"Site: {out}", markup=False, highlight=False, soft_wrap=True)
     if options.preview:
         console.print(f"Preview: {out / 'preview.png'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _check_name(out: Path) -> None:
+    """Raise `InputError` where the site, which has the name of its folder, would have a name that none can have."""
+    try:
+        TypeAdapter(Name).validate_python(out.name)
+    except ValidationError:
+        raise InputError.of(
+            "is the folder of no name that a site can have",
+            path="--out",
+            given=str(out),
+            allowed="letters, digits, '_', '.' and '-', beginning with a letter or digit",
+            suggestion="choose another folder",
+        ) from None
 
 
 _APART = ("parts", "warnings", "guesses", "bounds_m", "survey_area_m", "start_places_m")

@@ -18,9 +18,9 @@ COUNT = "sources"
 """The path whose ``count`` is varied."""
 CAN_VARY = (
     "what leaves names, sizes and structure as they are: sources.*.nuclide, position_m, height_m and activity_mbq, the "
-    "number of sources (sources: {count: [1, 3]}), vehicles.*.position_m and heading_deg, wind, failsafes, traffic, "
-    "radio.range_m and radio.loss, most numbers of mapping, localisation and identification, phases.*.settings, "
-    "phases.*.start.at_s and delay_s, and numbers in definitions other than materials"
+    "number of sources (sources: {count: [1, 3]}), vehicles.*.position_m and heading_deg, wind, background, failsafes, "
+    "traffic, radio.range_m and radio.loss, most numbers of knowledge, mapping, localisation and identification, "
+    "phases.*.settings, phases.*.start.at_s and delay_s, and numbers in definitions other than materials"
 )
 _FIXED_SECTIONS = {
     "name", "description", "site", "seed", "engine", "detection", "timing", "versions", "vary", "effects",

@@ -207,6 +207,37 @@ def test_import_site(project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
     assert "--force" in capsys.readouterr().err
 
 
+def test_import_site_under_a_name_or_with_a_unit_that_cannot_be(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (project / "yard.obj").write_text("v 0 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n")
+    before = everything(project)
+    assert cli.main(["import-site", "yard.obj", "--out", "configs/sites/höf ü"]) == 2
+    assert "--out: is the folder of no name that a site can have" in capsys.readouterr().err
+    assert cli.main(["import-site", "yard.obj", "--out", "configs/sites/yard", "--height-unit", "2"]) == 2
+    assert "--height-unit: is of elevation models only" in capsys.readouterr().err
+    assert everything(project) == before
+
+
+def test_check_begins_the_missions_of_users_policies(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (project / "mine.py").write_text(
+        "import jax.numpy as jnp\nimport swarmsim\n\n\nclass Up:\n    vehicles = ('multirotor',)\n\n"
+        "    def start(self, task, key):\n        return jnp.zeros(2)\n\n"
+        "    def act(self, task, memory, view, key):\n        return memory, swarmsim.fly_velocity(jnp.ones(3))\n\n\n"
+        "class Early(Up):\n    def task(self, assignment):\n        raise RuntimeError('no task')\n\n\n"
+        "class Late(Up):\n    def start(self, task, key):\n        raise KeyError('no start')\n"
+    )
+    mission = project / "configs/missions/mine.yaml"
+    wrong = {"Early": "mine.py:17: RuntimeError: no task", "Late": "mine.py:22: KeyError: 'no start'"}
+    for name in ("Up", *wrong):
+        mission.write_text(
+            "extends: landing\nname: mine\nphases:\n"
+            f"  - {{name: up, who: uav, policy: '../../mine.py:{name}', time_limit_s: 20}}\n"
+        )
+        assert cli.main(["check", "configs/missions/mine.yaml"]) == (2 if name in wrong else 0)
+        assert wrong.get(name, "") in capsys.readouterr().err
+
+
 def test_import_site_of_a_missing_file(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = everything(project)
     assert cli.main(["import-site", "no.dae", "--out", "configs/sites/new"]) == 2

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from crossings import crossed, outline_crossed
 from strangers import Stranger, draw, height_of, scan, with_holes, with_slab
 from yards import spec, write_tiff
@@ -126,6 +127,23 @@ def test_a_building_alone_gets_level_ground(tmp_path):
     assert model.report["traversable_share"] > 0.8
     assert len(model.report["start_places_m"]) >= 4
     np.testing.assert_allclose(model.site.terrain_m, 0.0, atol=1e-6)
+
+
+def test_walls_without_a_ground_are_told(tmp_path):
+    """Their tops, and a flat roof, would be all of the site."""
+    sizes = {
+        "south": ((30.0, 0.4, 2.5), (0.0, -15.0)),
+        "north": ((30.0, 0.4, 2.5), (0.0, 15.0)),
+        "house": ((8.0, 6.0, 2.5), (3.0, 2.0)),
+    }
+    boxes = {
+        name: trimesh.creation.box(size).apply_translation((*place, 1.25)) for name, (size, place) in sizes.items()
+    }
+    model = made(tmp_path, Stranger(boxes, suffix="glb"), holes_max=1.0)
+    assert any("of the model's extent only" in warning for warning in model.report["warnings"])
+    meshes = draw(np.random.default_rng(2))
+    whole = made(tmp_path, Stranger(meshes, suffix="glb"))
+    assert not any("of the model's extent only" in warning for warning in whole.report["warnings"])
 
 
 def hills(*shape):

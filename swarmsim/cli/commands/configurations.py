@@ -91,7 +91,6 @@ def import_site(
     file: Path,
     *,
     out: Path,
-    name: str | None = None,
     unit: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
     height_unit: Annotated[float | None, Parameter(validator=Number(gt=0))] = None,
     up: Literal["X", "Y", "Z"] | None = None,
@@ -118,9 +117,7 @@ def import_site(
     file
         The mesh or the elevation model.
     out
-        Folder of the new site; its name is the site's name unless --name is given.
-    name
-        Name of the site.
+        Folder of the new site; its name is the site's name.
     unit
         Metres of one unit of the file, where the file does not say or is wrong.
     height_unit
@@ -151,4 +148,4 @@ def import_site(
         "ground": list(ground) or None,
         "plane": None if plane is None else {"margin_m": plane},
     }
-    import_site_file(file, out, given, overrides, name, cell, licence, guess, force)
+    import_site_file(file, out, given, overrides, cell, licence, guess, force)
