@@ -128,6 +128,7 @@ def _check(out: Path, force: bool) -> None:
     check_folder(out, force, RUN)
     parent = next(p for p in out.absolute().parents if p.exists())
     if not parent.is_dir():
-        raise InputError.of("the results cannot be written there", path="--out", given=str(out))
+        message = f"the results cannot be written there: '{parent}' is no folder"
+        raise InputError.of(message, path="--out", given=str(out), suggestion="choose another folder with --out")
     with tempfile.TemporaryDirectory(prefix=".", dir=parent):
         pass  # permissions do not tell everything: a folder may lie in a file system that takes no files

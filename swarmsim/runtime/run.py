@@ -26,9 +26,7 @@ def build(scenario: Scenario) -> Simulation:
     No setting of the process is changed (see `swarmsim.use_all_cores`). Raises `InputError` with everything that is
     wrong.
     """
-    if not isinstance(scenario, Scenario):
-        hint = "load it first: swarmsim.build(swarmsim.load('recon'))"
-        raise InputError.of("is no scenario", given=repr(scenario)[:SHOWN], suggestion=hint)
+    _check_scenario(scenario, "swarmsim.build(swarmsim.load('recon'))")
     site_model = load_site(
         scenario.site_file, tuple(scenario.materials), [m.density_kg_m3 for m in scenario.materials.values()]
     )
@@ -47,6 +45,7 @@ def run(
     another run is being written there, and where there is too little room on the disk. When writing fails after the
     flight, the results are kept in a temporary place, which the error tells.
     """
+    _check_scenario(scenario, "swarmsim.run(swarmsim.load('recon'), 'out')")
     if not isinstance(out, str | os.PathLike):
         raise InputError.of("the folder of a run is named by a text or a path", path="out", given=repr(out)[:SHOWN])
     if not isinstance(missions, Integral) or isinstance(missions, bool) or missions < 1:
@@ -56,6 +55,11 @@ def run(
     check_space(out)
     with told_of(out), claimed(out):
         return _flown(scenario, out, missions, progress or SilentProgress(), force)
+
+
+def _check_scenario(scenario: object, call: str) -> None:
+    if not isinstance(scenario, Scenario):
+        raise InputError.of("is no scenario", given=repr(scenario)[:SHOWN], suggestion=f"load it first: {call}")
 
 
 def _flown(scenario: Scenario, out: Path, missions: int, tell: Progress, force: bool) -> tuple[MissionRecord, ...]:
