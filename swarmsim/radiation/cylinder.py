@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 _RAYS = 96  # per axis of the grid over the silhouette
 _CONE_RAYS = 4096
 NEAR_STEP = 0.1  # of ln(1 + 2 r / S) between two rows of the table of G
-NEAR_ROWS = 54  # to r = 100 S
+NEAR_ROWS = 68  # to r = 400 S; G is still 0.3 % above 1 there
 NEAR_COLUMNS = 31  # every 3 degrees from the axis to the side
 NEAR_TABLES = 3  # of which the G of every line is a sum; see `near_parts`
 _NEAR_NODES = 12  # attenuations that these are made from
