@@ -117,12 +117,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _ended(code: int, arguments: Sequence[str] | None) -> int:
-    """The exit code; the process ends with it where another thread still compiles or computes.
+    """The exit code. The command line's own process ends with it at once where something else still computes.
 
-    The interpreter would wait for that, which can take minutes.
+    The interpreter would wait for the threads in which programs are compiled, which can take minutes.
     """
-    others = [one for one in threading.enumerate() if one is not threading.current_thread() and not one.daemon]
-    if arguments is None and (others or code != EXIT_INPUT):
+    others = [one for one in threading.enumerate() if one is not threading.main_thread() and not one.daemon]
+    if arguments is None and (others or code != EXIT_INPUT):  # one that was stopped may compute in its main thread too
         with contextlib.suppress(OSError):
             sys.stdout.flush()
         os._exit(code)

@@ -112,19 +112,21 @@ class Scenario:
             if sha256 := registry.digest(policy, self.mission_file):
                 found[f"policy_sha256.{_found_from_anywhere(policy, self.mission_file)}"] = sha256
         for vehicle in self.vehicles:
-            if vehicle.body is not None:
+            # one that is missing is told where the body is read
+            if vehicle.body is not None and files.is_file(Path(vehicle.body.file)):
                 body = Path(vehicle.body.file).read_bytes()
                 found[f"body_sha256.{vehicle.name}"] = hashlib.sha256(body).hexdigest()
         return found
 
     def changes(self) -> list[str]:
         """Sentences on files that are no longer those that a fully resolved scenario was written with."""
-        wrote, have = self.mission.versions, self.versions()
+        wrote = {k: sha256 for k, sha256 in self.mission.versions.items() if k.partition(".")[0] in _FILES}
+        have = self.versions() if wrote else {}
         return [
             f"{_FILES[key.partition('.')[0]].format(key.partition('.')[2])} is no longer what it was when the scenario "
             f"was written (versions.{key}): it flies otherwise"
             for key, sha256 in wrote.items()
-            if key.partition(".")[0] in _FILES and have.get(key, sha256) != sha256
+            if have.get(key, sha256) != sha256
         ]
 
 

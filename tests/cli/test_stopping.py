@@ -67,3 +67,20 @@ entry.main()
     assert running.returncode == code
     assert told in error
     assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_input_ends_the_process_though_another_thread_computes() -> None:
+    """What a policy does wrong is found while other programs are compiled."""
+    script = """
+import sys, threading, time
+from swarmsim.cli import entry
+from swarmsim.config.errors import InputError
+def command(*arguments, **options):
+    threading.Thread(target=time.sleep, args=(600,)).start()
+    raise InputError.of("is wrong", path="phases.0.policy")
+entry.app = command
+sys.exit(entry.main())
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert ended.returncode == 2
+    assert ended.stderr == "phases.0.policy: is wrong\n"

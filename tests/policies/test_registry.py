@@ -220,6 +220,21 @@ def test_a_scenario_says_that_what_it_was_written_with_has_changed(project: Path
     assert "the file of the policy climb.py:climb is no longer what it was" in told
 
 
+def test_a_written_scenario_whose_body_file_is_missing_or_changed(project: Path) -> None:
+    vehicle = project.parent.parent / "vehicles" / "orpheus.yaml"
+    body = vehicle.with_name("body.urdf")
+    body.write_text("<robot name='r'/>")
+    vehicle.write_text(vehicle.read_text() + "\nbody: {file: body.urdf}\n")
+    written = project.parent / "written.yaml"
+    written.write_text(load_scenario(project).to_yaml())
+    assert load_scenario(written).changes() == []
+    body.write_text("<robot name='other'/>")
+    (told,) = load_scenario(written).changes()
+    assert "the body file of orpheus is no longer what it was" in told
+    body.unlink()  # which is told where the body is read
+    assert load_scenario(written).changes() == []
+
+
 @pytest.mark.parametrize(
     ("override", "fragment"),
     [

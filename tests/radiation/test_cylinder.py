@@ -84,17 +84,17 @@ def test_counts_against_rays(u: float, distance: float) -> None:
 def test_near_tables_hold_between_their_rows_and_attenuations(
     radius: float, length: float, least: float, most: float
 ) -> None:
-    """Of a Geiger tube, 1 cm from its end on, and for any line between 60 and 3000 keV in a crystal."""
+    """Of a Geiger tube, 5 mm from its end too, and for any line between 60 and 3000 keV in a crystal."""
     mu = np.geomspace(least, most, 9)
     near, shares = near_parts(radius, length, np.append(mu, [0.8 * least, 1.2 * most]))
     reach = half_diagonal(radius, length)
-    for distance in (0.056, 0.07, 0.1, 0.4, 3.0):
-        for u in np.cos(np.radians([0.0, 4.0, 25.0, 61.0, 90.0])):
+    for distance in (0.05, 0.056, 0.07, 0.1, 0.4, 3.0, 10.0):
+        for u in np.cos(np.radians([0.0, 2.0, 5.0, 7.0, 14.0, 25.0, 61.0, 90.0])):
             arguments = jnp.float32(distance / reach), jnp.float32(u), jnp.float32(np.sqrt(1.0 - u * u))
             found = shares[:9] @ np.asarray(near_ratio(jnp.asarray(near, jnp.float32), *arguments), np.float64)
             far = fraction_counted(radius, length, 1e4 * reach, u, mu) * 1e8
             exact = fraction_counted(radius, length, distance, u, mu) * ((distance / reach) ** 2 + 1.0) / far
-            np.testing.assert_allclose(found, exact, rtol=0.08 if distance < 0.06 else 0.05)
+            np.testing.assert_allclose(found, exact, rtol=0.07 if radius < 0.01 else 0.03)
 
 
 def test_nothing_counts_more_than_all_photons() -> None:
