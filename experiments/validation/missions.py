@@ -89,8 +89,7 @@ def detectable_ratios(simulation: Any, batch: Any) -> list[np.ndarray]:
 
     @jax.jit
     def of(windows: Any, key: jax.Array, plan: Any, place: Any, nuclide: Any, activity: Any) -> jax.Array:
-        measurements, spans = gathered(world, plan, windows, key)
-        problem = problem_of(plan.presumed, measurements, spans)
+        problem = problem_of(plan.presumed, gathered(world, plan, windows, key), plan.spans)
         state = no_sources(problem, place.shape[0], plan.presumed.nuclides.shape[0])
         sources = replace(state.sources, place=place, nuclide=nuclide, activity_bq=activity, present=activity > 0.0)
         added = signals(problem, sources, state.unknowns.lengths)

@@ -10,7 +10,10 @@ from swarmsim import randomness
 from swarmsim.estimation import (
     Estimated,
     Hotspots,
+    LocalisationParams,
+    MappingParams,
     Measurements,
+    Presumed,
     RadiationMap,
     concatenate,
     extract_hotspots,
@@ -18,13 +21,13 @@ from swarmsim.estimation import (
     localise,
 )
 from swarmsim.estimation.localise import nothing_found
-from swarmsim.estimation.nodes import Span, spans_of
+from swarmsim.estimation.nodes import Span
 from swarmsim.estimation.state import State
 from swarmsim.estimation.windows import Windows, measured, merged
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.state import Survey
 from swarmsim.missions.trail import Trail, poses_at
-from swarmsim.pytree import pytree
+from swarmsim.pytree import pytree, static
 from swarmsim.radiation.background import background_factor
 from swarmsim.radiation.detector import Detector, Source
 from swarmsim.radiation.identify import Identification, identify
@@ -56,17 +59,39 @@ class Conclusion:
     estimated: Estimated  # from all counts
 
 
-def gathered(
-    world: World, plan: Plan, windows: tuple[Windows | None, ...], key: jax.Array
-) -> tuple[Measurements, tuple[Span, ...]]:
-    """Counts of all groups after one another, at the measured places, and which rows which detector model has.
+@pytree
+class Premises:
+    """What an estimate takes from the plan, and nothing else: missions that agree in its kind share the program."""
+
+    presumed: Presumed
+    localisation: LocalisationParams
+    mapping: MappingParams
+    background_cps: tuple[jax.Array, ...]  # [] nominal one of each detector model
+    spans: tuple[Span, ...] = static()
+
+
+def premises_of(plan: Plan) -> Premises:
+    """The premises of a plan that `estimates`; they are taken from it as they are."""
+    assert plan.presumed is not None
+    assert plan.localisation is not None
+    assert plan.mapping is not None
+    return Premises(
+        presumed=plan.presumed,
+        localisation=plan.localisation,
+        mapping=plan.mapping,
+        background_cps=tuple(d.background_cps for d in plan.detectors),
+        spans=plan.spans,
+    )
+
+
+def gathered(world: World, plan: Plan, windows: tuple[Windows | None, ...], key: jax.Array) -> Measurements:
+    """Counts of all groups after one another, at the measured places; `Plan.spans` says of which detector models.
 
     The places of each vehicle are off by the same error throughout, as those of a GNSS receiver with RTK are for
     minutes; ``key`` is the mission's.
     """
     assert plan.presumed is not None
-    assert plan.localisation is not None
-    parts, groups = [], []
+    parts = []
     for group, held, kept in zip(world.groups, windows, plan.kept, strict=True):
         if held is None or group.counter is None:
             continue
@@ -75,8 +100,7 @@ def gathered(
         shifted = few.position_m + few.exposure_s[..., None] * off[:, None]
         few = replace(few, position_m=shifted, begin_m=few.begin_m + off[:, None])
         parts.append(measured(few, group.counter.index))
-        groups.append((parts[-1].counts.shape[0], group.counter.index, plan.localisation.rays))
-    return concatenate(*parts), spans_of(groups)
+    return concatenate(*parts)
 
 
 def pose_errors(std_m: jax.Array, key: jax.Array, member: jax.Array) -> jax.Array:
@@ -90,57 +114,50 @@ def pose_errors(std_m: jax.Array, key: jax.Array, member: jax.Array) -> jax.Arra
 class Inquiry:
     """What an estimate works on, and what it found."""
 
-    key: jax.Array  # data of the mission's
-    windows: tuple[Windows | None, ...]
+    measurements: Measurements  # all counts so far (`gathered`)
     survey: Survey  # what was known before, then what is known
     afresh: jax.Array  # [] bool: forget what was known before
 
 
-def learn(world: World, plan: Plan, inquiry: Inquiry) -> Inquiry:
+def learn(premises: Premises, inquiry: Inquiry) -> Inquiry:
     """The inquiry with the survey of all its counts, whose estimate goes on from the one before."""
     known = jax.tree.map(lambda x: jnp.where(inquiry.afresh, jnp.zeros_like(x), x), inquiry.survey.estimated.state)
-    measurements, spans = gathered(world, plan, inquiry.windows, jax.random.wrap_key_data(inquiry.key))
-    return replace(inquiry, survey=survey(plan, measurements, spans, known))
+    return replace(inquiry, survey=survey(premises, inquiry.measurements, known))
 
 
 def nothing_learned(world: World, plan: Plan, windows: tuple[Windows | None, ...], key: jax.Array) -> Survey | None:
     """A survey of no counts; None for a mission that does not estimate sources."""
     if not plan.estimates:
         return None
-    assert plan.localisation is not None
-    assert plan.presumed is not None
-    presumed, params = plan.presumed, plan.localisation
+    premises = premises_of(plan)
 
     def nothing() -> Survey:
-        measurements, spans = gathered(world, plan, windows, key)
-        estimated = nothing_found(presumed, measurements, spans, params)
-        chart, hotspots = _mapped(plan, measurements)
+        measurements = gathered(world, plan, windows, key)
+        estimated = nothing_found(premises.presumed, measurements, premises.spans, premises.localisation)
+        chart, hotspots = _mapped(premises, measurements)
         return Survey(map=chart, hotspots=hotspots, estimated=estimated, found=estimated.fits.present[0])
 
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(nothing))
 
 
-def survey(plan: Plan, measurements: Measurements, spans: tuple[Span, ...], known: State | None) -> Survey:
+def survey(premises: Premises, measurements: Measurements, known: State | None) -> Survey:
     """Interpolate the map, find hotspots, and estimate the sources, from where an earlier estimate came to."""
-    assert plan.localisation is not None
-    assert plan.presumed is not None
-    chart, hotspots = _mapped(plan, measurements)
-    estimated = localise(plan.presumed, measurements, spans, plan.localisation, known)
+    chart, hotspots = _mapped(premises, measurements)
+    estimated = localise(premises.presumed, measurements, premises.spans, premises.localisation, known)
     return Survey(map=chart, hotspots=hotspots, estimated=estimated, found=estimated.fits.present[0])
 
 
-def _mapped(plan: Plan, measurements: Measurements) -> tuple[RadiationMap, Hotspots]:
+def _mapped(premises: Premises, measurements: Measurements) -> tuple[RadiationMap, Hotspots]:
     """Map and hotspots.
 
     The map joins detectors of several models by their nominal backgrounds: the exposure of each is multiplied by its
     background over that of the first model, as if all its counts grew with its size alike.
     """
-    assert plan.mapping is not None
-    background = jnp.stack([d.background_cps for d in plan.detectors])
+    background = jnp.stack(premises.background_cps)
     size = jnp.where(background[0] > 0.0, background / jnp.maximum(background[0], 1e-9), 1.0)
     scaled = replace(measurements, exposure_s=measurements.exposure_s * size[measurements.detector])
-    chart = interpolate(plan.mapping, scaled)
-    return chart, extract_hotspots(plan.mapping, chart)
+    chart = interpolate(premises.mapping, scaled)
+    return chart, extract_hotspots(premises.mapping, chart)
 
 
 def named(
@@ -148,7 +165,7 @@ def named(
     world: World,
     plan: Plan,
     known: Survey,
-    windows: tuple[Windows | None, ...],
+    measurements: Measurements,
     trail: Trail | None = None,
 ) -> tuple[Survey, Accumulated, Identification]:
     """Identify the nuclide from the spectra near the first source, and let the estimate go on with it.
@@ -157,7 +174,6 @@ def named(
     places and times of the measurements.
     """
     assert plan.presumed is not None
-    measurements, _ = gathered(world, plan, windows, key)
     used, detector = _near_source(plan, known, measurements), plan.detectors[plan.spectrometer]
     spectrum = accumulate_spectrum(key, world, plan.spectrometer, measurements, used, trail)
     offset = known.estimated.fits.position_m[0] - measurements.position_m

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from swarmsim.estimation import LocalisationParams, MappingParams, Presumed
+from swarmsim.estimation.nodes import Span
 from swarmsim.missions.asked import Asked
 from swarmsim.policies import registry
 from swarmsim.pytree import pytree, static
@@ -139,6 +140,7 @@ class Plan:
     per_window: tuple[int, ...] = static()  # for each group: samples in a window of the estimate
     windows: tuple[int, ...] = static()  # for each group: windows that its vehicles can fill
     kept: tuple[int, ...] = static()  # for each group: windows of each vehicle that the estimate uses
+    spans: tuple[Span, ...] = static()  # of the estimate's windows: which rows which detector model measured
     bin_cells: int = static()  # side of a bin of the team's belief, in cells of the map
     spectrometer: int = static()  # detector model whose spectra are identified; -1 for none
     trail: int = static(default=0)  # decision periods in which the places of carried sources are kept for the spectra

@@ -1,6 +1,7 @@
 """From a scenario to the mission's plan (host)."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from swarmsim.config.mission import Trigger as TriggerSpec
 from swarmsim.config.policies import ParallelLines
 from swarmsim.config.scenario import Scenario
 from swarmsim.estimation import localisation_params, mapping_params, presume
+from swarmsim.estimation.nodes import Span, spans_of
 from swarmsim.estimation.radiation_map import MappingParams
 from swarmsim.estimation.recursive_map import default_bin_cells
 from swarmsim.kept import kept
@@ -50,6 +52,8 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
     detectors = tuple(counters[i].detector for i in range(len(detector_models(scenario))))
     localisation, identification = mission.localisation, mission.identification
     per_window, windows = _windows(scenario, world)
+    kept_windows = tuple(_kept_windows(group) for group in world.groups)
+    params = localisation_params(localisation) if localisation is not None and detectors else None
     mapping = presumed = None
     corners = mapped_area(scenario, site_model.site.survey_area_m)
     if localisation is not None and detectors:
@@ -61,7 +65,7 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
         site=site_model.site,
         detectors=detectors,
         mapping=mapping,
-        localisation=None if presumed is None or localisation is None else localisation_params(localisation),
+        localisation=params,
         presumed=presumed,
         spectrum_radius_m=on_host(0.0 if identification is None else identification.spectrum_radius_m),
         confidence_min=on_host(1.0 if identification is None else identification.confidence_min),
@@ -69,7 +73,8 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
         sensors=fit_sensors(scenario, world, periods=world.timing.judge_ticks) if senses(scenario) else None,
         per_window=per_window,
         windows=windows,
-        kept=tuple(_kept_windows(group) for group in world.groups),
+        kept=kept_windows,
+        spans=() if params is None else _spans(world, windows, kept_windows, params.rays),
         bin_cells=1 if mapping is None else default_bin_cells(mapping),
         spectrometer=-1 if identification is None else _spectrometer(world),
         trail=0 if identification is None else _trail(scenario, world),
@@ -136,6 +141,17 @@ ROWS_LEAST = 16  # of one vehicle
 
 def _kept_windows(group: Group) -> int:
     return max(ROWS_LEAST, ROWS[KINDS[group.kind].FLIES] // group.size)
+
+
+def _spans(world: World, windows: Sequence[int], kept_windows: Sequence[int], rays: int) -> tuple[Span, ...]:
+    """Spans of the windows that `swarmsim.missions.knowledge.gathered` puts after one another."""
+    return spans_of(
+        [
+            (group.size * each, group.counter.index, rays)
+            for group, size, each in zip(world.groups, windows, kept_windows, strict=True)
+            if size and group.counter is not None
+        ]
+    )
 
 
 def _spectrometer(world: World) -> int:

@@ -257,13 +257,25 @@ class Spread:
 
     def part(self, mission: int, chosen: Callable[[Any], Any]) -> Any:
         """What ``chosen`` takes of the pytree of one mission, on the host; nothing else is fetched from the devices."""
-        own, shared = iter(self.own), iter(self.shared)
-        arrays = [next(own) if carries else next(shared) for carries in self.carries]
+        arrays = self._arrays()
 
         def fetched(number: int) -> np.ndarray:
             return np.asarray(arrays[number][mission] if self.carries[number] else arrays[number])
 
         return jax.tree.map(fetched, chosen(jax.tree.unflatten(self.structure, range(len(arrays)))))
+
+    def chosen(self, chosen: Callable[[Any], Any]) -> "Spread":
+        """What ``chosen`` takes of the pytree, as one of its own: a program of it is the same whatever else differs."""
+        arrays = self._arrays()
+        numbers, structure = jax.tree.flatten(chosen(jax.tree.unflatten(self.structure, range(len(arrays)))))
+        carries = tuple(self.carries[number] for number in numbers)
+        own = [arrays[number] for number in numbers if self.carries[number]]
+        return Spread(structure, carries, own, [arrays[number] for number in numbers if not self.carries[number]])
+
+    def _arrays(self) -> list[Any]:
+        """All leaves in their order."""
+        own, shared = iter(self.own), iter(self.shared)
+        return [next(own) if carries else next(shared) for carries in self.carries]
 
 
 def _among_cores(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -8,13 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim.estimation import Measurements
 from swarmsim.missions.begin import begin_mission, begin_phase
 from swarmsim.missions.knowledge import (
     Accumulated,
     Conclusion,
     Inquiry,
+    gathered,
     learn,
     named,
+    premises_of,
 )
 from swarmsim.missions.plan import Plan
 from swarmsim.missions.segment import segment
@@ -121,33 +124,40 @@ class MissionRun:
             "again": Again(AT_ONCE, _onward),
         }
 
-    def _estimate(self, mission: MissionState, known: Survey, only: np.ndarray, afresh: bool) -> dict[str, Any]:
-        """The call that estimates the sources from all counts so far, in the missions ``only`` [B].
+    def _measured(self, mission: MissionState) -> Measurements:
+        """All counts so far."""
+        carried = mission.world.key, mission.windows
+        measured: Measurements = self._batch.run("gather", _gathered, self._inputs, carried)
+        return measured
+
+    def _estimate(self, measured: Measurements, known: Survey, only: np.ndarray, afresh: bool) -> dict[str, Any]:
+        """The call that estimates the sources from the counts ``measured``, in the missions ``only`` [B].
 
         One program makes all estimates of a mission, with what is known by then or ``afresh``: it takes longer to
-        compile than all others together.
+        compile than all others together, and asks for nothing but what an estimate depends on, so that missions with
+        other phases, policies and limits of time have the same.
         """
         forget = self._batch.put(np.full(self._batch.missions, afresh))
         return {
             "name": "estimate",
             "function": learn,
-            "inputs": self._inputs,
-            "carried": Inquiry(key=mission.world.key, windows=mission.windows, survey=known, afresh=forget),
+            "inputs": (self._inputs[1].chosen(premises_of),),
+            "carried": Inquiry(measurements=measured, survey=known, afresh=forget),
             "only": self._batch.put(only),
             "shared": True,
         }
 
     def _learned(self, mission: MissionState, known: Survey, only: np.ndarray, afresh: bool) -> Survey:
-        inquiry: Inquiry = self._batch.run(**self._estimate(mission, known, only, afresh))
+        inquiry: Inquiry = self._batch.run(**self._estimate(self._measured(mission), known, only, afresh))
         return inquiry.survey
 
-    def _naming(self, mission: MissionState, known: Survey) -> dict[str, Any]:
+    def _naming(self, mission: MissionState, measured: Measurements, known: Survey) -> dict[str, Any]:
         """The call that identifies the nuclide of the first source."""
         return {
             "name": "identify",
             "function": _named,
             "inputs": self._inputs,
-            "carried": (mission.world.key, known, mission.windows, mission.trail),
+            "carried": (mission.world.key, known, measured, mission.trail),
             "in_turn": True,
         }
 
@@ -161,8 +171,9 @@ class MissionRun:
         beginnings = [self._beginning(number, mission, 0, nobody) for number in range(len(self._plan.phases))]
         estimate, naming = list[dict[str, Any]](), list[dict[str, Any]]()
         if mission.survey is not None:
-            estimate = [self._estimate(mission, mission.survey, nobody, afresh=True)]
-            naming = [self._naming(mission, mission.survey)] if self._plan.spectrometer >= 0 else []
+            measured = self._measured(mission)
+            estimate = [self._estimate(measured, mission.survey, nobody, afresh=True)]
+            naming = [self._naming(mission, measured, mission.survey)] if self._plan.spectrometer >= 0 else []
         run = [self._advance(mission, 0, np.ones(groups, bool))] if segments else []
         calls = [*beginnings[:1], *estimate, *run, *beginnings[1:], *naming]
         self._batch.prepare(calls)
@@ -188,7 +199,7 @@ class MissionRun:
         identification: Identification | None = None
         guided = known
         if self._plan.spectrometer >= 0:
-            guided, spectrum, identification = self._batch.run(**self._naming(mission, known))
+            guided, spectrum, identification = self._batch.run(**self._naming(mission, self._measured(mission), known))
         end = self._learned(mission, guided, everyone, afresh=False)
         return Conclusion(survey=known, spectrum=spectrum, identification=identification, estimated=end.estimated)
 
@@ -233,8 +244,13 @@ def _onward(verdict: tuple[Signals, jax.Array], _: Any) -> tuple[jax.Array, Any]
 
 
 def _named(world: World, plan: Plan, carried: tuple[Any, ...]) -> tuple[Survey, Accumulated, Identification]:
-    key, known, windows, trail = carried
-    return named(jax.random.wrap_key_data(key), world, plan, known, windows, trail)
+    key, known, measured, trail = carried
+    return named(jax.random.wrap_key_data(key), world, plan, known, measured, trail)
+
+
+def _gathered(world: World, plan: Plan, carried: tuple[Any, ...]) -> Measurements:
+    key, windows = carried
+    return gathered(world, plan, windows, jax.random.wrap_key_data(key))
 
 
 def _segment_of(log: Log, ran: np.ndarray, periods: int) -> Segment:

@@ -1,11 +1,13 @@
 """What a mission knows before it has measured anything."""
 
 import jax
+import numpy as np
 import pytest
 
 import swarmsim
 from swarmsim.missions import knowledge
 from swarmsim.missions.begin import begin_mission
+from swarmsim.runtime.fingerprint import fingerprint
 
 
 @pytest.mark.parametrize(
@@ -20,9 +22,34 @@ def test_what_is_known_before_has_the_shapes_of_what_a_survey_tells(values: list
     mission, _ = jax.eval_shape(lambda: begin_mission(key, world, plan))
 
     def told(windows: object) -> object:
-        return knowledge.survey(plan, *knowledge.gathered(world, plan, windows, key), None)
+        return knowledge.survey(knowledge.premises_of(plan), knowledge.gathered(world, plan, windows, key), None)
 
     found = jax.eval_shape(told, mission.windows)
     assert jax.tree.structure(found) == jax.tree.structure(mission.survey)
     kinds = [[(x.shape, x.dtype) for x in jax.tree.leaves(tree)] for tree in (found, mission.survey)]
     assert kinds[0] == kinds[1]
+
+
+def kind_of_estimate(values: list[str]) -> str:
+    """What tells one program of the estimate from another, of `recon` with some values set."""
+    simulation = swarmsim.build(swarmsim.load("recon", values))
+    world, plan, key = simulation.world, simulation.plan, jax.random.key(0)
+    mission, _ = jax.eval_shape(lambda: begin_mission(key, world, plan))
+    measurements = jax.eval_shape(lambda windows: knowledge.gathered(world, plan, windows, key), mission.windows)
+    whole = (knowledge.premises_of(plan), measurements, mission.survey)
+    shapes = [(np.shape(x), str(x.dtype)) for x in jax.tree.leaves(whole)]
+    return fingerprint((jax.tree.structure(whole), shapes))
+
+
+def test_missions_that_fly_otherwise_estimate_by_the_same_program() -> None:
+    """The estimate takes longer to compile than all else; only what it depends on may ask for another."""
+    as_it_is = kind_of_estimate([])
+    others = [
+        ["engine=analytic", "timing.physics_steps=5", "wind.speed_m_s=0"],
+        ["phases.0.time_limit_s=300", "phases.1.time_limit_s=900", "phases.1.settings.laps=1"],
+        ["phases.0.settings.altitude_m=12", "sources.0.nuclide=Cs-137", "knowledge.nuclides=[Cs-137, Co-60]"],
+        ["vehicles.0.type=dji_f550", "vehicles.1.type=dji_f550", "vehicles.2.type=dji_f550"],
+    ]
+    for values in others:
+        assert kind_of_estimate(values) == as_it_is, values
+    assert kind_of_estimate(["localisation.sources_max=2"]) != as_it_is

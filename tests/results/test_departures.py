@@ -50,7 +50,7 @@ def test_pose_errors_are_what_the_estimate_has_in_its_places(simulation):
         nothing = windows_start(group.size, size, group.counter.detector.background_rois.shape[0])
         ones = jnp.ones_like(nothing.exposure_s)
         windows.append(replace(nothing, exposure_s=ones, samples=jnp.full(group.size, size, jnp.int32)))
-    measurements, _ = gathered(world, plan, tuple(windows), key)  # of crystals at the origin
+    measurements = gathered(world, plan, tuple(windows), key)  # of crystals at the origin
     shown = {tuple(np.round(row, 6)) for row in np.asarray(measurements.position_m) if np.any(row)}
     assert {tuple(np.round(error, 6)) for error in departures(simulation).pose_error_m.values()} == shown
 
