@@ -75,6 +75,8 @@ class Shape:
                 return self._resolve({"$ref": mapping[tag]}, value)
         if "anyOf" in schema:
             real = [option for option in schema["anyOf"] if option.get("type") != "null"]
+            if isinstance(value, list):  # where one or several may stand, it says which of the two is meant
+                real = [option for option in real if option.get("type") == "array"] or real
             if len(real) == 1:
                 return self._resolve(real[0], value)
         return schema

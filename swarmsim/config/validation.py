@@ -50,6 +50,7 @@ def problems_of(error: ValidationError, document: Document, cls: Any) -> list[Pr
     former = former_problems(document) if cls is Mission else []
     explained = {tuple((problem.path or "").split("."))[:1] for problem in former}
     found: dict[Place, Problem] = {}
+    whole: set[Place] = set()  # of them, mappings and lists that are not of the kind that may stand there
     for details in error.errors(include_url=False):
         if len(found) > PROBLEMS_MAX:
             break
@@ -60,8 +61,16 @@ def problems_of(error: ValidationError, document: Document, cls: Any) -> list[Pr
             continue  # pydantic counts only the items that passed: the items' own problems say more
         if isinstance(place[-1] if place else None, int) and details["type"] == "missing":
             place = place[:-1]
+        if isinstance(details["input"], dict | list) and _is_of_type(details):
+            whole.add(place)
         found.setdefault(place, _problem(details, place, document, shape))
-    return sorted([*former, *found.values()], key=lambda problem: problem.line or 0)
+    # a list where one word or several may stand is no word: its items' own problems say more
+    told = [problem for p, problem in found.items() if p not in whole or not any(p == q[: len(p)] != q for q in found)]
+    return sorted([*former, *told], key=lambda problem: problem.line or 0)
+
+
+def _is_of_type(details: ErrorDetails) -> bool:
+    return details["type"] == "literal_error" or details["type"].endswith("_type")
 
 
 def _place(details: ErrorDetails, data: Any) -> Place:

@@ -78,3 +78,13 @@ def test_no_room_for_sources_and_parts_varied_twice_are_told():
         swarmsim.load("recon", twice)
     with pytest.raises(swarmsim.InputError, match="setting it changes nothing"):
         swarmsim.load("random_recon", ["sources.1.activity_mbq=5"])
+
+
+def test_a_wrong_word_in_a_list_is_told_once_where_it_stands() -> None:
+    """One region or a list of them may stand there: pydantic finds the list to be no word as well."""
+    with pytest.raises(swarmsim.InputError) as caught:
+        swarmsim.load("random_recon", ["vary.sources.*.position_m={place: {region: [open, indors]}}"])
+    (problem,) = caught.value.problems
+    assert (problem.path or "").endswith("position_m.place.region.1")
+    assert problem.given == "indors"
+    assert problem.suggestion == "did you mean 'indoors'?"
