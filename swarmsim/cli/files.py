@@ -66,7 +66,7 @@ def check_file(path: Path) -> tuple[str, list[str]]:
         if scenario.family:
             from swarmsim.runtime.run import build
 
-            build(scenario)
+            _check_policies(scenario, build(scenario))
             varied = ", ".join(dict.fromkeys(v.key for v in scenario.family))
             return f"mission, a family that varies {varied}", warnings
         raise_if_any(check_site(scenario))
@@ -85,8 +85,11 @@ def check_file(path: Path) -> tuple[str, list[str]]:
     return kind.removesuffix("s"), warnings
 
 
-def _check_policies(scenario: Any) -> None:
-    """Begin the mission of users' policies without computing anything. Raises `InputError` where one of them fails."""
+def _check_policies(scenario: Any, built: Any = None) -> None:
+    """Begin the mission of users' policies without computing anything. Raises `InputError` where one of them fails.
+
+    ``built`` is the simulation, where there is one already.
+    """
     from swarmsim.policies.registry import is_shipped
 
     if all(is_shipped(phase.policy) for phase in scenario.mission.phases):
@@ -96,7 +99,7 @@ def _check_policies(scenario: Any) -> None:
     from swarmsim.missions.begin import begin_mission
     from swarmsim.runtime.run import build
 
-    simulation = build(scenario)
+    simulation = build(scenario) if built is None else built
     jax.eval_shape(begin_mission, jax.random.key(0), simulation.world, simulation.plan)
 
 

@@ -241,6 +241,12 @@ def _check_estimates(scenario: Scenario) -> Iterator[Problem]:
     if mission.localisation is not None and mission.mapping is None:
         message = "the estimate starts from the hotspots of the map, and the mission has no mapping"
         yield scenario.problem(("localisation",), message, suggestion="add mapping, or leave localisation out")
+    at_work = {number for team in scenario.phase_members for number in team}
+    carried = [scenario.vehicles[number].detector is not None for number in at_work]
+    if mission.localisation is not None and mission.mapping is not None and at_work and not any(carried):
+        message = "there is nothing to estimate sources from: no vehicle with a detector has a part in a phase"
+        hint = "name one in a phase's who, or leave localisation out"
+        yield scenario.problem(("localisation",), message, suggestion=hint)
     if mission.identification is not None and mission.localisation is None:
         message = "spectra are taken round the estimated source, and the mission has no localisation"
         yield scenario.problem(("identification",), message, suggestion="add localisation, or leave identification out")

@@ -122,12 +122,21 @@ class Scenario:
         """Sentences on files that are no longer those that a fully resolved scenario was written with."""
         wrote = {k: sha256 for k, sha256 in self.mission.versions.items() if k.partition(".")[0] in _FILES}
         have = self.versions() if wrote else {}
+        # the file of a policy may be named by another way to it now
+        names = [_last_name(key) for key in have]
+        by_name = {name: sha256 for name, sha256 in zip(names, have.values(), strict=True) if names.count(name) == 1}
         return [
             f"{_FILES[key.partition('.')[0]].format(key.partition('.')[2])} is no longer what it was when the scenario "
             f"was written (versions.{key}): it flies otherwise"
             for key, sha256 in wrote.items()
-            if have.get(key, sha256) != sha256
+            if have.get(key, by_name.get(_last_name(key), sha256)) != sha256
         ]
+
+
+def _last_name(key: str) -> str:
+    """A key of `Scenario.versions` without the folders of a policy's file."""
+    kind, _, name = key.partition(".")
+    return f"{kind}.{Path(name).name}"
 
 
 def load_scenario(name_or_path: str | Path, overrides: Sequence[str] = (), seed: int | None = None) -> Scenario:

@@ -20,7 +20,8 @@ Answer = TypeVar("Answer")
 FOUND = ("source", "hotspot")
 """What a policy can need the mission to find."""
 _SHOWN = 60
-_NOT_OWN = ("/site-packages/", str(Path(__file__).parents[1]))  # of a traceback: where a user's mistake comes to light
+_PACKAGE = Path(__file__).parents[1]
+_LIBRARIES = {"jax", "jaxlib", "numpy", "mujoco", "optax"}  # beside which a user's policy may be installed
 _WORDS = {
     "needs": ("needs", "thing that a mission finds"),
     "senses": ("senses", "kind of sensor"),
@@ -38,7 +39,7 @@ def ask(reference: str, what: str, question: Callable[[], Answer]) -> Answer:
         if stop := stop_of(error):
             raise stop from None
         frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is here
-        own = [frame for frame in frames if not any(part in frame.filename for part in _NOT_OWN)] or frames
+        own = [frame for frame in frames if _is_users(Path(frame.filename))] or frames
         where = f"{shown_path(Path(own[-1].filename))}:{own[-1].lineno}: " if own else ""
         words = str(error).strip().partition("\n")[0]  # JAX adds paragraphs
         raise InputError.of(
@@ -46,6 +47,13 @@ def ask(reference: str, what: str, question: Callable[[], Answer]) -> Answer:
             given=reference,
             suggestion="mend the policy's code",
         ) from error
+
+
+def _is_users(file: Path) -> bool:
+    """Whether a line of a traceback is of a user's code: where a mistake was made, not where it comes to light."""
+    _, found, inside = str(file.as_posix()).rpartition("/site-packages/")
+    library = found and inside.partition("/")[0] in _LIBRARIES
+    return not library and not file.is_relative_to(_PACKAGE)
 
 
 def names_of(reference: str, what: str, given: Any, known: Sequence[str]) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ from swarmsim.results.record import (
 )
 from swarmsim.results.samples import READ, measured_rows, samples_of, windows_of
 from swarmsim.results.sources import true_sources
-from swarmsim.results.status import Fit, Verdict, assess, survey_doubts
+from swarmsim.results.status import Fit, Verdict, assess, source_of_spectrum, survey_doubts
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import MissionBatch, Simulation
 from swarmsim.site.model import height_at
@@ -56,11 +56,13 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     nuclides = _nuclides(simulation)
     surveyed: tuple[Estimate, ...] = ()
     final: tuple[Estimate, ...] = ()
-    spectrum = None
+    spectrum, telling, examined = None, None, None
     if conclusion is not None:
         surveyed = _estimates(conclusion.survey.estimated, nuclides)
         final = _estimates(conclusion.estimated, nuclides)
         spectrum = _spectrum(simulation, conclusion)
+    examined = _examined(simulation, spectrum, surveyed, final)
+    telling = None if examined is None else spectrum
     world = batch.worlds.of(index)
     pose_std_m = batch.plans.part(index, lambda plan: None if plan.presumed is None else plan.presumed.pose_std_m)
     sources = true_sources(simulation, world, vehicles)
@@ -68,7 +70,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     chart = None if conclusion is None else _map(simulation, conclusion.survey)
     verdict = None
     if conclusion is not None and chart is not None:
-        verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, spectrum, end)
+        verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, telling, examined or 0, end)
     events = sorted(_events(simulation, end, phases), key=lambda event: event.time_s)
     return MissionRecord(
         name=simulation.scenario.mission.name,
@@ -88,7 +90,9 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         sources=sources,
         paths_m=_paths(simulation, end),
         events=tuple(events),
-        finding=finding(verdict, final, spectrum, _hindrance(simulation, end, events), _one_nuclide(simulation)),
+        finding=finding(
+            verdict, final, telling, _hindrance(simulation, end, events), _one_nuclide(simulation), examined or 0
+        ),
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
         warnings=(*((CROWDED,) if bool(end.world.crowded) else ()), *survey_doubts(surveyed, final)),
@@ -332,6 +336,7 @@ def _verdict(
     aerial: tuple[Estimate, ...],
     final: tuple[Estimate, ...],
     spectrum: Spectrum | None,
+    examined: int,
     end: MissionState,
 ) -> Verdict:
     """Status of the mission's answer."""
@@ -344,8 +349,9 @@ def _verdict(
     of_vehicle = used[samples.vehicle]
     highest = np.array([highest_rate(detector) for detector in detectors])
     background = np.array([float(detector.background_cps) for detector in detectors])
-    shown = spectrum is not None and spectrum.nuclide != UNNAMED[NONE] and not _no_way(simulation, end)
-    suggested = spectrum.nuclide if spectrum is not None and shown else ""
+    suggested = ""
+    if spectrum is not None and spectrum.nuclide != UNNAMED[NONE] and not _no_way(simulation, end):
+        suggested = spectrum.nuclide if spectrum.confidence >= float(simulation.plan.confidence_min) else ""
     fit = Fit(
         misfit=float(estimated.misfit), chi_squared=float(estimated.chi_squared), strain=float(estimated.strain)
     )  # fmt: skip
@@ -363,7 +369,16 @@ def _verdict(
         gamma_constants(simulation, final),
         {} if spectrum is None else spectrum.scores,
         suggested,
+        examined,
     )
+
+
+def _examined(
+    simulation: Simulation, spectrum: Spectrum | None, surveyed: tuple[Estimate, ...], final: tuple[Estimate, ...]
+) -> int | None:
+    """Number of the source of ``final`` that the spectrum is of; None where there is none."""
+    taken_at = None if spectrum is None else next(iter(surveyed), None)
+    return source_of_spectrum(taken_at, final, float(simulation.plan.spectrum_radius_m))
 
 
 def _one_nuclide(simulation: Simulation) -> bool:

@@ -22,33 +22,38 @@ def finding(
     spectrum: Spectrum | None,
     hindrance: str | None,
     presumed: bool,
+    spectrum_of: int = 0,
 ) -> str:
     """What was found, and why it is not to be believed where it is not.
 
     Args:
         verdict: on the answer; None where no source was sought.
         final: sources by all counts, the surest first.
-        spectrum: taken near the surest one; None where none was.
+        spectrum: taken near one of them; None where none was.
         hindrance: what kept rovers from it, as far as known.
         presumed: whether one nuclide alone is in question.
+        spectrum_of: number of the source near which it was taken.
     """
     by = "nuclide presumed" if presumed else "nuclide by the counts"
     if verdict is None:
         return NOTHING_SOUGHT
-    found = _found(final, spectrum, hindrance, by)
+    found = _found(final, spectrum, hindrance, by, spectrum_of)
     if not verdict.reasons:
         return found
     return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
 
 
-def _found(final: tuple[Estimate, ...], spectrum: Spectrum | None, hindrance: str | None, by: str) -> str:
+def _found(
+    final: tuple[Estimate, ...], spectrum: Spectrum | None, hindrance: str | None, by: str, spectrum_of: int
+) -> str:
     if not final:
         return NOTHING_FOUND
-    first = _surest(final[0], spectrum, hindrance, by) + _besides(final, spectrum)
+    told = [_placed(one) for one in final]
+    examined = _examined(final[spectrum_of], spectrum, hindrance, by) + _besides(final, spectrum)
+    told[spectrum_of] = f"{told[spectrum_of]}; {examined}"
     if len(final) == 1:
-        return f"a source of {first}"
-    others = "; ".join(f"of {_placed(one)}" for one in final[1:])
-    return f"{len(final)} sources: of {first}; {others}"
+        return f"a source of {told[0]}"
+    return f"{len(final)} sources: of {'; of '.join(told)}"
 
 
 def _placed(estimate: Estimate) -> str:
@@ -75,11 +80,10 @@ def _activity(estimate: Estimate) -> str:
     return f"{value:.{digits}f} ± {std:.{digits}f} MBq"
 
 
-def _surest(estimate: Estimate, spectrum: Spectrum | None, hindrance: str | None, by: str) -> str:
-    place = _placed(estimate)
+def _examined(estimate: Estimate, spectrum: Spectrum | None, hindrance: str | None, by: str) -> str:
     if spectrum is None or hindrance == NO_WAY:
-        return f"{place}; {by}, {hindrance or NO_SPECTRUM}"
-    return f"{place}; {_identified(estimate, spectrum, by)}"
+        return f"{by}, {hindrance or NO_SPECTRUM}"
+    return _identified(estimate, spectrum, by)
 
 
 def _besides(final: tuple[Estimate, ...], spectrum: Spectrum | None) -> str:

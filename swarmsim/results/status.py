@@ -79,6 +79,7 @@ def assess(
     at_1_m: Mapping[str, GammaConstant] = MappingProxyType({}),
     identified: Mapping[str, float] = MappingProxyType({}),
     suggested: str = "",
+    spectrum_of: int = 0,
 ) -> Verdict:
     """Judge an answer.
 
@@ -93,8 +94,9 @@ def assess(
         background_std: how much a background may differ from place to place, of its logarithm.
         activity: what is presumed of a source's, in MBq, and the standard deviation of its logarithm.
         at_1_m: dose rates of the nuclides that were found, by which the strength of different ones is compared.
-        identified: probability of each nuclide in the spectrum taken near the surest source.
+        identified: probability of each nuclide in the spectrum.
         suggested: the nuclide that the spectrum is of, or "unknown"; empty where none was taken or it shows none.
+        spectrum_of: number of the source near which it was taken (`source_of_spectrum`).
     """
     covered = coverage(samples, chart, ground_m)
     reasons = []
@@ -107,7 +109,8 @@ def assess(
         reasons.append(f"only {covered:.0%} of the survey area was measured")
     strength = [one.activity_mbq * at_1_m[one.nuclide].kerma_ugy_h if at_1_m else one.activity_mbq for one in final]
     doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity)
-    doubts += _mixed(final, identified) + _contradicted(final, suggested)
+    examined = final[spectrum_of] if final else None
+    doubts += _mixed(final, examined, identified) + _contradicted(examined, suggested)
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     reasons += [sentence for _, sentence in doubts]
@@ -207,29 +210,45 @@ def _companions(final: Sequence[Estimate], strength: Sequence[float]) -> list[tu
     return found
 
 
-def _mixed(final: Sequence[Estimate], identified: Mapping[str, float]) -> list[tuple[Status, str]]:
+def source_of_spectrum(taken_at: Estimate | None, final: Sequence[Estimate], radius_m: float) -> int | None:
+    """Number of the source of ``final`` that a spectrum is of: the nearest to the estimate ``taken_at``, if near.
+
+    Spectra are taken within ``radius_m`` of the source that was the surest then. By all counts another one may be,
+    or it may be elsewhere.
+    """
+    if taken_at is None or not final:
+        return None
+    apart = [_apart_m(one, taken_at) for one in final]
+    nearest = int(np.argmin(apart))
+    return nearest if apart[nearest] < radius_m else None
+
+
+def _mixed(
+    final: Sequence[Estimate], examined: Estimate | None, identified: Mapping[str, float]
+) -> list[tuple[Status, str]]:
     """Different nuclides in one place: few energy windows tell two of them from a third one, which a spectrum does."""
     found: list[tuple[Status, str]] = []
     for one, other in itertools.combinations(final, 2):
         apart, names = _apart_m(one, other), (one.nuclide, other.nuclide)
-        # the first is the surest one
-        shown = one is final[0] and all(identified.get(name, 0.0) > CONFIRMED for name in names)
+        shown = any(x is examined for x in (one, other)) and all(
+            identified.get(name, 0.0) > CONFIRMED for name in names
+        )
         if names[0] != names[1] and apart < ONE_M and not shown:
             text = f"the {names[0]} and {names[1]} sources {apart:.2g} m apart may be one of another nuclide"
             found.append(("ambiguous", text))
     return found
 
 
-def _contradicted(final: Sequence[Estimate], suggested: str) -> list[tuple[Status, str]]:
-    """A spectrum of another nuclide than that under which its source was sought.
+def _contradicted(examined: Estimate | None, suggested: str) -> list[tuple[Status, str]]:
+    """A spectrum of another nuclide than that under which the source was sought near which it was taken.
 
     None of 222 located missions of `random_recon` had one; before, a weak source beside a strong one 4 standard
     deviations from its place did.
     """
-    if not final or suggested in ("", final[0].nuclide):
+    if examined is None or suggested in ("", examined.nuclide):
         return []
     other = "none in the library" if suggested == "unknown" else suggested
-    return [("ambiguous", f"the spectrum taken near the {final[0].nuclide} source is of {other}")]
+    return [("ambiguous", f"the spectrum taken near the {examined.nuclide} source is of {other}")]
 
 
 def _implausible(final: Sequence[Estimate], presumed_mbq: float, std: float) -> list[tuple[Status, str]]:

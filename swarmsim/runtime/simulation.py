@@ -162,9 +162,21 @@ class Simulation:
                 raise InputError.of(
                     "needs a value for each mission", path=str(path), given=given, allowed=f"a list of {missions}"
                 )
+            self._check_defined(str(path))
         scenario = self.scenario
         named = {canonical(scenario.document, path, scenario.mission_file): each for path, each in values.items()}
         return with_given(draws, named)
+
+    def _check_defined(self, path: str) -> None:
+        """Raise `InputError` for a value in a definition that the mission does not hold, but the library."""
+        section, *where = path.split(".")
+        there: Any = self.scenario.document.data.get("definitions")
+        for step in where[:2]:
+            there = there.get(step) if isinstance(there, Mapping) else None
+        if section == "definitions" and there is None and len(where) > 2:
+            hint = f'set it once when the mission is loaded: swarmsim.load(mission, ["{path}=…"])'
+            what = f"is in no definition of the mission: values are those of the library's {where[1]}"
+            raise InputError.of(what, path=path, suggestion=hint)
 
     def _drawn(self, seed: int, row: Mapping[str, Any], given: Sequence[str] = ()) -> tuple[World, Plan]:
         """World and plan of a mission with these values; raises `InputError`, which tells the seed, for wrong ones."""

@@ -236,6 +236,10 @@ def test_check_begins_the_missions_of_users_policies(project: Path, capsys: pyte
         )
         assert cli.main(["check", "configs/missions/mine.yaml"]) == (2 if name in wrong else 0)
         assert wrong.get(name, "") in capsys.readouterr().err
+    with mission.open("a") as file:  # of a family they are begun as well
+        file.write("vary: {wind.speed_m_s: {uniform: [0, 2]}}\n")
+    assert cli.main(["check", "configs/missions/mine.yaml"]) == 2
+    assert wrong["Late"] in capsys.readouterr().err
 
 
 def test_import_site_of_a_missing_file(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

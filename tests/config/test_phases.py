@@ -272,6 +272,17 @@ def test_a_team_that_cannot_measure_finds_nothing(mission: Path) -> None:
     assert "needs the hotspot, and no vehicle of the team carries a detector to find it" in message
 
 
+def test_a_detector_that_has_no_part_in_a_phase_estimates_nothing(mission: Path) -> None:
+    bare_type(mission)
+    bare = (
+        "vehicles=[{name: uav1, type: bare, position_m: [0, 0]}, {name: uav2, type: tarot_t650, position_m: [20, 0]}]"
+    )
+    only = "phases=[{name: survey, who: uav1, policy: hold, time_limit_s: 20}]"
+    told = "localisation: there is nothing to estimate sources from: no vehicle with a detector has a part in a phase"
+    assert told in message_of(mission, bare, only)
+    assert load_scenario(mission, [bare, only.replace("uav1", "[uav1, uav2]")])
+
+
 def test_a_team_that_resolves_no_energies_identifies_nothing(mission: Path) -> None:
     for file in (mission.parents[1] / "vehicles").glob("*.yaml"):
         data = read_file(file).data

@@ -254,6 +254,10 @@ def test_wrong_values_are_told_as_given_and_not_as_drawn(standing):
         standing.rollout([3, 4], values={"sources.0.nuclide": ["Co-60", "Zz"]})
     with pytest.raises(swarmsim.InputError, match=r"^values wind\.speed_m_s: "):
         standing.rollout([3, 4], values={"wind.speed_m_s": [1.0, -1.0]})
+    of_the_library = "definitions.vehicles.tarot_t650.battery.capacity_wh"
+    with pytest.raises(swarmsim.InputError, match="is in no definition of the mission") as told:
+        standing.rollout([3, 4], values={of_the_library: [100.0, 90.0]})
+    assert f'swarmsim.load(mission, ["{of_the_library}=' in str(told.value)
 
 
 def test_values_in_the_stead_of_a_family_make_a_single_scenario(standing):

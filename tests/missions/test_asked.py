@@ -1,10 +1,12 @@
 """Policies of users that fail, or answer what cannot be, are told as wrong input with the file and the line."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import pytest
+from jax.tree_util import register_pytree_node_class
 
 from swarmsim.config.errors import InputError
 from swarmsim.control.commands import DriveCommand, fly_velocity
@@ -77,6 +79,70 @@ def test_what_a_branch_on_a_traced_value_says_is_one_line() -> None:
 def test_what_act_gives_is_looked_at(task, answer, fragment) -> None:
     with pytest.raises(InputError, match=fragment):
         Asked("my.py:P", Policy(answer)).act(task(), jnp.zeros(2), None, None)
+
+
+@register_pytree_node_class
+class Memory:
+    """A user's own, which prints as its address."""
+
+    def __init__(self, place, level):
+        self.place, self.level = place, level
+
+    def tree_flatten(self):
+        return (self.place, self.level), None
+
+    @classmethod
+    def tree_unflatten(cls, _, leaves):
+        return cls(*leaves)
+
+
+def test_memories_are_compared_by_what_they_hold_and_not_by_how_they_print() -> None:
+    def grown(m):
+        return (Memory(m[0].place + 1.0, m[0].level), Memory(m[1].place, m[1].level)), fly_velocity(jnp.zeros(3))
+
+    before = (Memory(jnp.zeros(2), jnp.zeros(())), Memory(jnp.zeros(3), jnp.zeros(())))
+    after, _ = Asked("my.py:P", Policy(grown)).act(uav(), before, None, None)
+    assert after[0].place.tolist() == [1.0, 1.0]
+    wrong = Policy(lambda m: ((m[0], Memory(m[1].place[:2], m[1].level)), fly_velocity(jnp.zeros(3))))
+    with pytest.raises(InputError, match="shape and type") as told:
+        Asked("my.py:P", wrong).act(uav(), before, None, None)
+    assert "float32[2]" in str(told.value)
+    assert " at 0x" not in str(told.value)
+
+
+@pytest.mark.parametrize("given", ["text", {1, 2}, {"a": "text"}, (jnp.zeros(2), print)])
+def test_what_is_no_array_is_told(given) -> None:
+    policy = SimpleNamespace(
+        start=lambda *_: given, task=lambda *_: given, act=lambda *_: (given, fly_velocity(jnp.zeros(3)))
+    )
+    asked = Asked("my.py:P", policy)
+    for name, call in (
+        ("start", lambda: asked.start(None, None)),
+        ("task", lambda: asked.task(None)),
+        ("act", lambda: asked.act(uav(), jnp.zeros(2), None, None)),
+    ):
+        with pytest.raises(InputError, match=rf"{name}\(\) of the policy 'my.py:P' must give arrays"):
+            call()
+
+
+@pytest.mark.parametrize("given", [None, jnp.zeros(3, bool), 1.0, "yes"])
+def test_a_policy_is_done_or_not(given) -> None:
+    with pytest.raises(InputError, match=r"done\(\) of the policy 'my.py:P' must give"):
+        Asked("my.py:P", SimpleNamespace(done=lambda *_: given)).done(None, None, None)
+    for right in (True, jnp.array(False)):
+        assert Asked("my.py:P", SimpleNamespace(done=lambda *_, right=right: right)).done(None, None, None) is right
+
+
+@pytest.mark.parametrize("given", [None, jnp.zeros((3, 3))])
+def test_a_planner_gives_paths(given) -> None:
+    with pytest.raises(InputError, match="must give the paths of its vehicles"):
+        Asked("my.py:P", SimpleNamespace(plan=lambda *_: given)).plan(None, None, None)
+
+
+def test_a_command_with_a_word_in_it_is_told() -> None:
+    command = replace(fly_velocity(jnp.zeros(3)), yaw_rad="north")
+    with pytest.raises(InputError, match="gives no command"):
+        Asked("my.py:P", Policy((jnp.zeros(2), command))).act(uav(), jnp.zeros(2), None, None)
 
 
 def test_what_is_right_passes() -> None:

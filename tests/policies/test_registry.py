@@ -208,7 +208,9 @@ def test_a_scenario_with_a_policy_of_the_users(project: Path) -> None:
     assert load_scenario(project, [phase_of("{}", "climb.py:Plan")]).settings[0] == PolicySettings()
 
 
-def test_a_scenario_says_that_what_it_was_written_with_has_changed(project: Path) -> None:
+def test_a_scenario_says_that_what_it_was_written_with_has_changed(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scenario = load_scenario(project, [phase_of("{altitude_m: 12}")])
     assert scenario.changes() == []
     written = project.parent / "written.yaml"
@@ -218,6 +220,10 @@ def test_a_scenario_says_that_what_it_was_written_with_has_changed(project: Path
     file.write_text(CLIMB.replace("period_s = 0.5", "period_s = 0.25"))
     (told,) = load_scenario(written).changes()
     assert "the file of the policy climb.py:climb is no longer what it was" in told
+    beside = file.absolute().with_name("written.yaml")
+    beside.write_text(written.read_text())
+    monkeypatch.chdir("/")  # from elsewhere the policy is found beside the scenario, by its absolute path
+    assert any("climb.py:climb is no longer what it was" in told for told in load_scenario(beside).changes())
 
 
 def test_a_written_scenario_whose_body_file_is_missing_or_changed(project: Path) -> None:

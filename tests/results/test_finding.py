@@ -122,3 +122,11 @@ def test_how_well_the_place_is_known_is_said_by_its_largest_deviation(std, said)
     covariance = turn @ np.diag([std**2, (0.3 * std) ** 2, 900.0]) @ turn.T
     one = replace(estimate(), position_m=np.array([3.126, -0.497, 0.0]), covariance_m2=covariance)
     assert f" at {said} (" in finding(SURE, (one,), None, hindrance=None, presumed=False)
+
+
+def test_the_source_that_a_spectrum_was_taken_near_is_the_one_that_it_names():
+    pair = (*ONE, estimate(30.0, nuclide="Cs-137"))
+    said = finding(SURE, pair, spectrum("Cs-137"), None, False, spectrum_of=1)
+    first, second = said.split("; of ")
+    assert "identified" not in first
+    assert second.endswith("; identified with 97.0%")

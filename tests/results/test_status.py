@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
-from swarmsim.results.status import CERTAIN, Fit, assess, coverage, survey_doubts
+from swarmsim.results.status import CERTAIN, Fit, assess, coverage, source_of_spectrum, survey_doubts
 
 GOOD = Fit(misfit=0.3, chi_squared=1.01)
 SIDE_M, HEIGHT_M = 60.0, 20.0
@@ -41,7 +41,7 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
 def verdict(
     samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0,
     at_1_m=MappingProxyType({}), presumed=(100.0, 10.0), identified=MappingProxyType({}),
-    suggested="",
+    suggested="", spectrum_of=0,
 ):  # fmt: skip
     samples = survey() if samples is None else samples
     n = len(samples.counts)
@@ -50,6 +50,7 @@ def verdict(
         samples, chart(hotspots, rate), limits, np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
         (presumed[0], float(np.log(presumed[1]))), at_1_m, identified, suggested,
+        spectrum_of,
     )  # fmt: skip
 
 
@@ -96,7 +97,21 @@ def test_a_spectrum_of_another_nuclide_contradicts_the_surest_source() -> None:
     assert stranger.reasons == ("the spectrum taken near the Co-60 source is of none in the library",)
     both = (estimate(), estimate(40.0, nuclide="Cs-137"))
     assert verdict(final=both, suggested="Cs-137").status == "ambiguous"
+    # by all counts the source that was the surest to the survey need not be that any more
+    at_the_second = verdict(final=both, suggested="Cs-137", spectrum_of=1)
+    assert not any("the spectrum" in reason for reason in at_the_second.reasons)
+    wrong = verdict(final=both, suggested="Co-60", spectrum_of=1)
+    assert "the spectrum taken near the Cs-137 source is of Co-60" in wrong.reasons
     assert verdict(found=False, hotspots=(), suggested="Cs-137").status == "none"
+
+
+def test_a_spectrum_is_of_the_source_that_it_was_taken_near() -> None:
+    sources = (estimate(0.0), estimate(40.0), estimate(45.0))
+    assert source_of_spectrum(estimate(1.0), sources, 12.0) == 0
+    assert source_of_spectrum(estimate(41.0), sources, 12.0) == 1
+    assert source_of_spectrum(estimate(20.0), sources, 12.0) is None
+    assert source_of_spectrum(estimate(1.0), (), 12.0) is None
+    assert source_of_spectrum(None, sources, 12.0) is None
 
 
 def test_two_nuclides_in_one_place_are_believed_where_the_spectrum_shows_both() -> None:
