@@ -45,7 +45,7 @@ class Asked:
     def _act(self, task: Any, memory: Any, view: Any, key: jax.Array) -> tuple[Any, Any]:
         given = self._call("act", self._policy.act, task, memory, view, key)
         if not (isinstance(given, tuple) and len(given) == 2):
-            raise self._wrong("act", "must give two values", type(given).__name__, "the memory and a command")
+            raise self._wrong("act", "must give two values", _words(given), "the memory and a command")
         after, command = given
         if self._kinds("act", after) != self._kinds("act", memory):
             what = "must give a memory of the shape and type that it was given"

@@ -39,7 +39,9 @@ def ask(reference: str, what: str, question: Callable[[], Answer]) -> Answer:
         if stop := stop_of(error):
             raise stop from None
         frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is here
-        own = [frame for frame in frames if _is_users(Path(frame.filename))] or frames
+        # of a call that does not fit the method's arguments there is no line but this package's
+        outside = [frame for frame in frames if not Path(frame.filename).is_relative_to(_PACKAGE)]
+        own = [frame for frame in frames if _is_users(Path(frame.filename))] or outside
         where = f"{shown_path(Path(own[-1].filename))}:{own[-1].lineno}: " if own else ""
         words = str(error).strip().partition("\n")[0]  # JAX adds paragraphs
         raise InputError.of(

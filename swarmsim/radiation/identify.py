@@ -50,6 +50,8 @@ _BASE_SIZE = (0, 1, 1, 2)  # nuclides of the base of each stage
 _MODEL_ERROR = 0.015
 """Relative error of an expected spectrum in a bin, for the goodness of fit: an estimate."""
 
+COUNTS_MOST = 1e6  # of a spectrum that are used
+
 
 @pytree
 class Identification:
@@ -102,7 +104,7 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
     ``view`` is how the crystal saw the source (`swarmsim.radiation.rate.mean_view`), by default from far away, end on:
     from the side or close by, soft photons count more than hard ones.
 
-    Without live time and counts the posterior is the prior. Of what is no spectrum (numbers below zero or none, counts
+    Of more than `COUNTS_MOST` counts a part is used. Without live time and counts the posterior is the prior. Of what is no spectrum (numbers below zero or none, counts
     without live time) the answer is `UNKNOWN`, with a confidence and a goodness of 0. Only nuclides for which the
     detector has tables are named, and at most three at once. Raises `InputError` for a detector without energy
     resolution, and for another number of channels than the detector's.
@@ -116,6 +118,9 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
     sound = jnp.all(jnp.isfinite(counts) & (counts >= 0)) & jnp.isfinite(live_s)
     sound &= (live_s > 0.0) | (jnp.sum(counts) == 0)
     counts, live_s = jnp.where(sound, counts, 0.0), jnp.where(sound, live_s, 0.0)
+    # more counts tell nothing beside the model's error, and sums of them lose what tells hypotheses apart in float32
+    part = COUNTS_MOST / jnp.maximum(jnp.sum(counts), COUNTS_MOST)
+    counts, live_s = part * counts, part * live_s
     table, data = tables(detector, view), binned_data(detector, counts, live_s)
     strangers = _strangers(detector, table, data)
     stages = _stages(table, data, jnp.asarray(np.log(shield_shares(detector)), jnp.float32), n)
@@ -155,7 +160,7 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
         gain=best.gain,
         width=jnp.sqrt(1.0 + 2.0 * best.time),
         goodness=jnp.where(sound, p_value(data.counts, best.expected, data.certainty, fitted, _MODEL_ERROR), 0.0),
-        fit=_in_channels(detector, best.expected),
+        fit=_in_channels(detector, best.expected) / part,
         stranger=strangers.nuclide,
         alike=strangers.share * jnp.exp(known - unknown),
     )

@@ -66,7 +66,11 @@ class Fit(NamedTuple):
 
 def binned_data(detector: Detector, counts: jax.Array, live_s: jax.Array) -> Data:
     """The data of a spectrum ``counts`` [channels] of ``live_s`` [] seconds."""
-    binned = jnp.diff(jnp.pad(jnp.cumsum(counts), (1, 0))[np.asarray(detector.identification_bins)])
+    # bin by bin: differences of a running sum lose the counts of small bins beside those of ten million in others
+    edges = np.asarray(detector.identification_bins)
+    bin_of = np.repeat(np.arange(len(edges) - 1), np.diff(edges))
+    inside = counts[edges[0] : edges[-1]]
+    binned = jax.ops.segment_sum(inside, bin_of, len(edges) - 1, indices_are_sorted=True)
     natural = jnp.maximum(detector.background_cps, 1.0) * jnp.maximum(live_s, 1e-3)
     return Data(
         counts=binned,

@@ -50,6 +50,12 @@ def test_a_method_that_fails_says_where() -> None:
         Asked("my.py:P", Policy(None)).start(None, None)
 
 
+def test_a_method_of_other_arguments_is_told_without_a_line_of_ours() -> None:
+    with pytest.raises(InputError, match=r"start\(\) of the policy 'my.py:P' fails: TypeError: ") as told:
+        Asked("my.py:P", SimpleNamespace(start=lambda only: only)).start(None, None)
+    assert "asked.py" not in str(told.value)
+
+
 def test_what_a_branch_on_a_traced_value_says_is_one_line() -> None:
     import jax
 

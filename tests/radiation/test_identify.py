@@ -85,6 +85,18 @@ def test_the_fit_in_channels_is_the_spectrum(library: Library, detectors: Detect
     assert np.all(np.asarray(found.fit)[0, first - 1 :] > 0.0)
 
 
+def test_a_spectrum_of_a_hundred_million_counts_is_named(library: Library, detectors: Detectors) -> None:
+    """Beside a source of 200 GBq: sums over such counts had no digits left, and the answer was background, with 0.97."""
+    detector = detectors["nai_2x2", "physical"]
+    mean = np.asarray(spectrum(detector, "Cs-137", 1e8 / LIVE_S)) + np.asarray(detector.background_spectrum)
+    found = run(detector, np.round(mean * LIVE_S)[None], LIVE_S)
+    assert detector.nuclide_names[int(found.nuclide[0])] == "Cs-137"
+    assert found.confidence[0] > 0.999
+    assert 0.0 <= float(found.goodness[0]) <= 1.0
+    assert float(np.sum(found.fit[0])) == pytest.approx(1e8, rel=0.02)
+    assert float(np.sum(found.strength_cps[0])) == pytest.approx(1e8 / LIVE_S, rel=0.02)
+
+
 def test_bare_background_has_no_nuclide(detectors: Detectors) -> None:
     for kind in ("physical", "paper_ideal"):
         for name in ("nai_1p5x1p5", "nai_2x2"):
