@@ -201,13 +201,15 @@ class Simulation:
         path = f"{problem.path}."
         if any(path.startswith(f"{own}.") or f"{own}.".startswith(path) for own in given):
             return replace(told, file="values")
-        for varied in self.scenario.family:
-            if path.startswith(f"{varied.path}.") or f"{varied.path}.".startswith(path):
-                place = ("vary", varied.key, varied.distribution.kind)
-                message = f"draws a value with which the mission is wrong: {told.message}"
-                hints = {"given": told.given, "allowed": told.allowed, "suggestion": told.suggestion}
-                return self.scenario.problem(place, message, **hints)
-        return told
+        family = self.scenario.family
+        about = [v for v in family if path.startswith(f"{v.path}.") or f"{v.path}.".startswith(path)]
+        if not about:
+            return told
+        varied = max(about, key=lambda v: len(v.path))  # the number of sources is about all that is wrong with one
+        place = ("vary", varied.key, varied.distribution.kind)
+        message = f"draws a value with which the mission is wrong: {told.message}"
+        hints = {"given": told.given, "allowed": told.allowed, "suggestion": told.suggestion}
+        return self.scenario.problem(place, message, **hints)
 
     def _spread(
         self, batch: Batch, draws: Draws, layout: Layout, given: Sequence[str] = ()

@@ -88,3 +88,9 @@ def test_a_wrong_word_in_a_list_is_told_once_where_it_stands() -> None:
     assert (problem.path or "").endswith("position_m.place.region.1")
     assert problem.given == "indors"
     assert problem.suggestion == "did you mean 'indoors'?"
+
+
+def test_what_is_wrong_is_told_where_it_is_drawn_and_not_at_the_number_of_sources() -> None:
+    wrong = ["vary.sources={count: [1, 2]}", "vary.sources.*.nuclide={choice: [Cs-137, Co-61]}", "engine=analytic"]
+    with pytest.raises(swarmsim.InputError, match=r"vary\.sources\.\*\.nuclide\.choice: draws a value with which"):
+        swarmsim.build(swarmsim.load("random_recon", wrong))
