@@ -104,10 +104,10 @@ def identify(detector: Detector, counts: jax.Array, live_s: jax.Array, view: jax
     ``view`` is how the crystal saw the source (`swarmsim.radiation.rate.mean_view`), by default from far away, end on:
     from the side or close by, soft photons count more than hard ones.
 
-    Of more than `COUNTS_MOST` counts a part is used. Without live time and counts the posterior is the prior. Of what is no spectrum (numbers below zero or none, counts
-    without live time) the answer is `UNKNOWN`, with a confidence and a goodness of 0. Only nuclides for which the
-    detector has tables are named, and at most three at once. Raises `InputError` for a detector without energy
-    resolution, and for another number of channels than the detector's.
+    Of more than `COUNTS_MOST` counts a part is used. Without live time and counts the posterior is the prior. Of what
+    is no spectrum (numbers below zero or none, counts without live time) the answer is `UNKNOWN`, with a confidence and
+    a goodness of 0. Only nuclides for which the detector has tables are named, and at most three at once. Raises
+    `InputError` for a detector without energy resolution, and for another number of channels than the detector's.
     """
     if not detector.identification_bins:
         raise InputError.of("a counter without energy resolution tells no nuclides apart: use a scintillator")
