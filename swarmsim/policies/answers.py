@@ -53,7 +53,7 @@ def ask(reference: str, what: str, question: Callable[[], Answer]) -> Answer:
 
 def _is_users(file: Path) -> bool:
     """Whether a line of a traceback is of a user's code: where a mistake was made, not where it comes to light."""
-    _, found, inside = str(file.as_posix()).rpartition("/site-packages/")
+    _, found, inside = file.as_posix().rpartition("/site-packages/")
     library = found and inside.partition("/")[0] in _LIBRARIES
     return not library and not file.is_relative_to(_PACKAGE)
 

@@ -56,7 +56,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     nuclides = _nuclides(simulation)
     surveyed: tuple[Estimate, ...] = ()
     final: tuple[Estimate, ...] = ()
-    spectrum, telling, examined = None, None, None
+    spectrum = None
     if conclusion is not None:
         surveyed = _estimates(conclusion.survey.estimated, nuclides)
         final = _estimates(conclusion.estimated, nuclides)

@@ -94,7 +94,7 @@ class MissionRun:
         """Begin a phase in the missions ``begin`` [B]; what it is to know of the sources is estimated before."""
         if self._plan.phases[number].target == "source":
             assert mission.survey is not None
-            survey = self._learned(mission, mission.survey, begin, afresh=True)
+            survey = self._learned(self._measured(mission), mission.survey, begin, afresh=True)
             mission = replace(mission, survey=survey)
         begun: MissionState = self._batch.run(**self._beginning(number, mission, tick, begin))
         return begun
@@ -147,8 +147,8 @@ class MissionRun:
             "shared": True,
         }
 
-    def _learned(self, mission: MissionState, known: Survey, only: np.ndarray, afresh: bool) -> Survey:
-        inquiry: Inquiry = self._batch.run(**self._estimate(self._measured(mission), known, only, afresh))
+    def _learned(self, measured: Measurements, known: Survey, only: np.ndarray, afresh: bool) -> Survey:
+        inquiry: Inquiry = self._batch.run(**self._estimate(measured, known, only, afresh))
         return inquiry.survey
 
     def _naming(self, mission: MissionState, measured: Measurements, known: Survey) -> dict[str, Any]:
@@ -192,15 +192,15 @@ class MissionRun:
         if known is None:
             return None
         self._tell.phase("estimate and identify", 0.0)
-        everyone = np.ones(self._batch.missions, bool)
+        everyone, measured = np.ones(self._batch.missions, bool), self._measured(mission)
         if not self._plan.asks:
-            known = self._learned(mission, known, everyone, afresh=True)
+            known = self._learned(measured, known, everyone, afresh=True)
         spectrum: Accumulated | None = None
         identification: Identification | None = None
         guided = known
         if self._plan.spectrometer >= 0:
-            guided, spectrum, identification = self._batch.run(**self._naming(mission, self._measured(mission), known))
-        end = self._learned(mission, guided, everyone, afresh=False)
+            guided, spectrum, identification = self._batch.run(**self._naming(mission, measured, known))
+        end = self._learned(measured, guided, everyone, afresh=False)
         return Conclusion(survey=known, spectrum=spectrum, identification=identification, estimated=end.estimated)
 
 
