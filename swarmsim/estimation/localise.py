@@ -21,7 +21,7 @@ from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.nodes import Span, nodes_of
 from swarmsim.estimation.pairs import strain
 from swarmsim.estimation.posterior import of_others, posteriors
-from swarmsim.estimation.seek import SearchParams
+from swarmsim.estimation.seek import SearchParams, least_of
 from swarmsim.estimation.sources import find_sources
 from swarmsim.estimation.starts import Places, places_of
 from swarmsim.estimation.state import Sources, State, no_sources, ratios
@@ -102,6 +102,7 @@ class Estimated:
     chi_squared: jax.Array  # [] over its degrees of freedom, about 1 for a model that describes the counts
     strain: jax.Array  # [] what windows' rates depart from the model by, beyond what is usual (`pairs.strain`)
     windows: jax.Array  # [] number of valid ones
+    noticed_bq: jax.Array  # [N] from which on a further source in the open would have been noticed; inf: never
     state: State  # to go on from when there are more counts
 
 
@@ -271,8 +272,8 @@ def localise(
             sources=replace(known.sources, place=jnp.where(there, known.sources.place, state.sources.place)),
             unknowns=replace(state.unknowns, level=known.unknowns.level, lengths=known.unknowns.lengths),
         )
-    state = find_sources(problem, presumed.places, nuclides, params.search, state)
-    return _report(presumed, problem, params, state)
+    state, seen = find_sources(problem, presumed.places, nuclides, params.search, state)
+    return _report(presumed, problem, params, state, seen)
 
 
 def nothing_found(
@@ -305,6 +306,7 @@ def nothing_found(
         chi_squared=zero,
         strain=zero,
         windows=jnp.int32(0),
+        noticed_bq=jnp.zeros(np.shape(presumed.nuclides)),
         state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
     )
 
@@ -329,7 +331,7 @@ def sampled(
 
 
 def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
-    """Activities [K] in Bq from which on another source is noticed, by the information [K] about its activity.
+    """Activities [...] in Bq from which on another source is noticed, by the information [...] about its activity.
 
     ``further`` [] is what it must reach. Infinite where it would have to be stronger than any.
     """
@@ -337,7 +339,9 @@ def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
     return jnp.where(activity < 1e6 * ACTIVITY_MAX_MBQ, activity, jnp.inf)
 
 
-def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Estimated:
+def _report(
+    presumed: Presumed, problem: Problem, params: LocalisationParams, state: State, seen: jax.Array
+) -> Estimated:  # fmt: skip
     site, s, m = presumed.site, state.sources, problem.measurements
     posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
@@ -384,5 +388,6 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         chi_squared=overall.chi_squared / overall.freedom,
         strain=strained - usual,
         windows=jnp.sum(m.valid),
+        noticed_bq=jnp.where(presumed.nuclides, noticed_from(seen, least_of(params.search, state)), jnp.inf),
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -33,6 +33,7 @@ class Scanned:
     statistic: jax.Array  # [C] largest over the nuclides
     nuclide: jax.Array  # [C] int32 which one that is
     activity_bq: jax.Array  # [C] that it has by the score
+    information: jax.Array  # [C, N] (1/Bq^2) about the activity of each nuclide there
 
 
 def open_rates(detector: Detector, nuclides: int, air: int) -> jax.Array:
@@ -119,6 +120,7 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
         statistic=jnp.take_along_axis(statistic, chosen, axis=1)[:, 0],
         nuclide=best.astype(jnp.int32),
         activity_bq=jnp.take_along_axis(score / information, chosen, axis=1)[:, 0],
+        information=information,
     )
 
 

@@ -58,13 +58,17 @@ def sought(
     slot: jax.Array,
     adding: jax.Array,
     wide: jax.Array,
-) -> tuple[State, jax.Array]:
-    """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one."""
+) -> tuple[State, jax.Array, jax.Array]:
+    """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one.
+
+    And what information [N] about the activity of a further one the grid tells of (`Looked`); 0 where none was
+    ``adding``.
+    """
     others = without(state, slot).added
-    starts, statistic = for_those(
+    starts, looked = for_those(
         adding | wide,
         lambda: starts_of(problem, places, allowed, others, state.unknowns),
-        lambda: (no_starts(places), jnp.zeros(())),
+        lambda: no_starts(places, allowed.shape[0]),
     )
 
     def look() -> tuple[State, jax.Array]:
@@ -77,8 +81,9 @@ def sought(
         after = replace(after, sources=replace(after.sources, nuclide_value=table))
         return jax.tree.map(partial(jnp.where, found), after, state), found
 
-    worth = ~adding | (statistic > PROMISING * params.threshold)
-    return for_those(worth, look, lambda: (state, jnp.array(False)), IN_STEP)
+    worth = ~adding | (looked.statistic > PROMISING * params.threshold)
+    after, found = for_those(worth, look, lambda: (state, jnp.array(False)), IN_STEP)
+    return after, found, jnp.where(adding, looked.information, 0.0)
 
 
 def least_of(params: SearchParams, state: State) -> jax.Array:

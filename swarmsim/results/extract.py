@@ -56,10 +56,12 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     nuclides = _nuclides(simulation)
     surveyed: tuple[Estimate, ...] = ()
     final: tuple[Estimate, ...] = ()
+    noticed: dict[str, float] = {}
     spectrum = None
     if conclusion is not None:
         surveyed = _estimates(conclusion.survey.estimated, nuclides)
         final = _estimates(conclusion.estimated, nuclides)
+        noticed = _noticed(simulation, conclusion.estimated)
         spectrum = _spectrum(simulation, conclusion)
     examined = _examined(simulation, spectrum, surveyed, final)
     telling = None if examined is None else spectrum
@@ -91,11 +93,18 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         paths_m=_paths(simulation, end),
         events=tuple(events),
         finding=finding(
-            verdict, final, telling, _hindrance(simulation, end, events), _one_nuclide(simulation), examined or 0
+            verdict,
+            final,
+            telling,
+            _hindrance(simulation, end, events),
+            _one_nuclide(simulation),
+            examined or 0,
+            noticed,
         ),
         status="not_sought" if verdict is None else verdict.status,
         covered=None if verdict is None else verdict.covered,
         warnings=(*((CROWDED,) if bool(end.world.crowded) else ()), *survey_doubts(surveyed, final)),
+        noticed_mbq=noticed,
         drawn=batch.draws.told(index),
         windows_kev=windows_of(simulation),
         at_1_m=gamma_constants(simulation, (*surveyed, *final, *sources)),
@@ -245,6 +254,14 @@ def _estimates(estimated: Estimated, nuclides: tuple[str, ...]) -> tuple[Estimat
         )
         for k in np.flatnonzero(np.asarray(fits.present))
     )
+
+
+def _noticed(simulation: Simulation, estimated: Estimated) -> dict[str, float]:
+    """Detection limits of the nuclides in question (`MissionRecord.noticed_mbq`)."""
+    presumed = simulation.plan.presumed
+    assert presumed is not None
+    names = _nuclides(simulation)
+    return {names[k]: float(estimated.noticed_bq[k]) * 1e-6 for k in np.flatnonzero(np.asarray(presumed.nuclides))}
 
 
 def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:

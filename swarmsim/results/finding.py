@@ -1,10 +1,13 @@
 """The sentence that says what a mission found, and why it is not to be believed where it is not."""
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
+from swarmsim.estimation.starts import MOST
 from swarmsim.results.record import Estimate, Spectrum
 from swarmsim.results.status import CONFIRMED, Verdict, in_mbq
 
@@ -23,6 +26,7 @@ def finding(
     hindrance: str | None,
     presumed: bool,
     spectrum_of: int = 0,
+    noticed_mbq: Mapping[str, float] = MappingProxyType({}),
 ) -> str:
     """What was found, and why it is not to be believed where it is not.
 
@@ -33,11 +37,12 @@ def finding(
         hindrance: what kept rovers from it, as far as known.
         presumed: whether one nuclide alone is in question.
         spectrum_of: number of the source near which it was taken.
+        noticed_mbq: activities from which on nuclides would have been noticed (`MissionRecord.noticed_mbq`).
     """
     by = "nuclide presumed" if presumed else "nuclide by the counts"
     if verdict is None:
         return NOTHING_SOUGHT
-    found = _found(final, spectrum, hindrance, by, spectrum_of)
+    found = _found(final, spectrum, hindrance, by, spectrum_of) if final else NOTHING_FOUND + _noticed(noticed_mbq)
     if not verdict.reasons:
         return found
     return f"{verdict.status.replace('_', ' ')}: {found}; but {'; '.join(verdict.reasons)}"
@@ -46,14 +51,26 @@ def finding(
 def _found(
     final: tuple[Estimate, ...], spectrum: Spectrum | None, hindrance: str | None, by: str, spectrum_of: int
 ) -> str:
-    if not final:
-        return NOTHING_FOUND
     told = [_placed(one) for one in final]
     examined = _examined(final[spectrum_of], spectrum, hindrance, by) + _besides(final, spectrum)
     told[spectrum_of] = f"{told[spectrum_of]}; {examined}"
     if len(final) == 1:
         return f"a source of {told[0]}"
     return f"{len(final)} sources: of {'; of '.join(told)}"
+
+
+def _noticed(noticed_mbq: Mapping[str, float]) -> str:
+    """How strong a source would have had to be: "none" says little without."""
+    if not noticed_mbq:
+        return ""
+    limits = sorted((value, name) for name, value in noticed_mbq.items() if math.isfinite(value))
+    if not limits:
+        return f" (nor would one of any activity have been noticed in the open, over {MOST:.0%} of the survey area)"
+    told = [f"{in_mbq(value)} {name}" for value, name in (limits[0], limits[-1])]
+    from_ = told[0] if len(limits) == 1 else f"{told[0]} to {told[1]}"
+    never = sorted(set(noticed_mbq) - {name for _, name in limits})
+    but = f", but none of {' or '.join(never[:3])}{' and others' if len(never) > 3 else ''}" if never else ""
+    return f" (in the open, over {MOST:.0%} of the survey area, one would have been noticed from {from_} on{but})"
 
 
 def _placed(estimate: Estimate) -> str:

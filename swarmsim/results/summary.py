@@ -70,7 +70,9 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
 
     Errors are distances to the nearest true source: of the hotspot on the map (horizontal), of the source in space. A
     line or an area counts by its centre of activity, a source on a vehicle by where it was at the start; activities are
-    those of the start. ``departures`` is what was drawn for the mission within its knowledge (`departures_summary`).
+    those of the start. ``noticed_mbq`` is the activity by nuclide from which on a source in the open, beside those
+    found, would have been noticed (`MissionRecord.noticed_mbq`; None: none would). ``departures`` is what was drawn for
+    the mission within its knowledge (`departures_summary`).
     """
     record = record.finite()
     hotspot = hotspot_of(record.map)
@@ -92,6 +94,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "survey_estimate": estimate_summary(record.survey_estimate, record),
         "source": estimate_summary(record.estimate, record),
         "further_sources": [estimate_summary(one, record) for one in record.further],
+        "noticed_mbq": {name: value if np.isfinite(value) else None for name, value in record.noticed_mbq.items()},
         "nuclide": {
             "name": named(spectrum),
             "confidence": None if spectrum is None else float(spectrum.confidence),

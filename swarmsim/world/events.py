@@ -6,7 +6,8 @@ import numpy as np
 
 LOSSES = ("crash", "obstacle", "vehicle", "battery_empty", "non_finite")
 """crash: hit the ground too hard or tipped over · obstacle, vehicle: collided with one · battery_empty · non_finite:
-its state stopped being a number and is held at the last good one. The motors are off from then on."""
+its state or its command stopped being a number, and it is held at the last good state. The motors are off from then on.
+"""
 FAILSAFES = ("fence", "wind", "battery_low", "link_lost")
 """The autopilot has taken over (`swarmsim.world.failsafes`): it flies on, its part in the mission has ended."""
 KINDS = LOSSES + FAILSAFES
@@ -17,7 +18,7 @@ DESCRIPTIONS = {
     "obstacle": "collided with an obstacle",
     "vehicle": "collided with another vehicle",
     "battery_empty": "used up its battery",
-    "non_finite": "had a non-finite state, and was stopped at its last finite one",
+    "non_finite": "had a non-finite state or command, and was stopped where it was last finite",
     "fence": "failsafe: was about to leave the fence",
     "wind": "failsafe: the air carried it off although it did nearly all that it can",
     "battery_low": "failsafe: its battery was low",

@@ -188,7 +188,8 @@ def move(world: World, kind: str, params: Any, state: GroupState, command: Any) 
         state.around.wind_m_s, state.around.motor_noise, world.site,
         engine=world.engine, dt=timing.time_step_s, substeps=timing.substeps, layout=world.layout,
     )  # fmt: skip
-    total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves(vehicle))
+    # limits in the autopilot would make something of a command that is none
+    total = sum(jnp.sum(leaf) for leaf in jax.tree.leaves((vehicle, command)))
     finite = jnp.isfinite(total)  # a sum is finite only if all of its parts are
     moves = moving(state) & finite & state.finite
     kept = jax.tree.map(lambda new, old: jnp.where(moves, new, old), (vehicle, control), (state.vehicle, state.control))

@@ -127,7 +127,10 @@ def test_no_activity_is_a_clear_finding(simulation):
     silent = swarmsim.build(swarmsim.load("recon", (*RECON, "sources.0.activity_mbq=0")))
     assert jax.tree.structure(silent.world) == jax.tree.structure(world)
     record = swarmsim.mission_record(silent, silent.rollout(1), 0)
-    assert record.finding == "no source above background"
+    assert record.finding.startswith("no source above background (in the open, over 95% of the survey area, one would")
+    # from 15 m above, in lines 10 m apart
+    assert 2.0 < record.noticed_mbq["Co-60"] < 40.0
+    assert set(record.noticed_mbq) == {"Co-60"}
     assert record.estimate is None
     assert record.spectrum is None
     assert len(record.map.hotspots_m) == 0

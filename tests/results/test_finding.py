@@ -27,6 +27,26 @@ def test_nothing_sought_and_nothing_found():
     assert finding(replace(SURE, status="none"), (), None, hindrance=None, presumed=False) == NOTHING_FOUND
 
 
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ({"Co-60": 12.3}, "over 95% of the survey area, one would have been noticed from 12 MBq Co-60 on)"),
+        ({"Co-60": 12.3, "Am-241": 345.6, "Na-22": 9.87}, "noticed from 9.9 MBq Na-22 to 346 MBq Am-241 on)"),
+        ({"Co-60": 12.3, "Pu-239": np.inf}, "noticed from 12 MBq Co-60 on, but none of Pu-239)"),
+        ({"Co-60": np.inf}, "nor would one of any activity have been noticed"),
+    ],
+)
+def test_none_comes_with_what_would_have_been_noticed(limits, said):
+    none = replace(SURE, status="none")
+    told = finding(none, (), None, hindrance=None, presumed=True, noticed_mbq=limits)
+    assert told.startswith(NOTHING_FOUND + " (")
+    assert said in told
+    doubtful = finding(replace(none, reasons=("only 40% was measured",)), (), None, None, True, 0, limits)
+    assert said in doubtful
+    assert doubtful.endswith("; but only 40% was measured")
+    assert "would have been" not in finding(SURE, ONE, None, hindrance=None, presumed=True, noticed_mbq=limits)
+
+
 @pytest.mark.parametrize(("presumed", "said"), [(True, "nuclide presumed"), (False, "nuclide by the counts")])
 def test_it_says_where_the_nuclide_is_from(presumed, said):
     assert f"; {said}, no spectrum" in finding(SURE, ONE, None, hindrance=None, presumed=presumed)

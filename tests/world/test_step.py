@@ -232,12 +232,16 @@ def test_a_group_that_does_not_run_is_left_as_it_is(world, start):
     assert np.all(state.groups[0].vehicle.body.position_m[:, 2] > 0.5)
 
 
-@pytest.mark.parametrize("level", ["position", "rotor speed"])
+@pytest.mark.parametrize("level", ["position", "yaw", "acceleration", "rotor speed"])
 def test_a_non_finite_command_stops_its_vehicle_and_no_other(world, start, level):
     up, rover = airborne(world, start, HIGH, velocity_m_s=(0.5, 0.0, 0.0)), stay(world, start)[1]
     fine = full_command(world, 0, jax.vmap(go_to)(jnp.asarray(HIGH) + 1.0))
     if level == "position":
         broken = replace(fine, position_m=fine.position_m.at[2, 1].set(jnp.nan))
+    elif level == "yaw":
+        broken = replace(fine, yaw_rad=fine.yaw_rad.at[2].set(jnp.nan))
+    elif level == "acceleration":
+        broken = replace(fine, acceleration_m_s2=fine.acceleration_m_s2.at[2, 2].set(jnp.inf))
     else:
         speeds = up.groups[0].vehicle.rotor_speed_rad_s.at[2, 1].set(jnp.nan)
         bad = full_command(world, 0, RotorSpeedCommand(rotor_speed_rad_s=speeds))
@@ -256,6 +260,16 @@ def test_a_non_finite_command_stops_its_vehicle_and_no_other(world, start, level
         assert np.isfinite(now).all()
         np.testing.assert_array_equal(np.asarray(now)[2], np.asarray(held)[2])
         np.testing.assert_array_equal(np.asarray(now)[kept], np.asarray(free)[kept])
+
+
+@pytest.mark.parametrize("field", ["speed_m_s", "yaw_rate_rad_s"])
+def test_a_rover_with_a_non_finite_command_is_stopped(world, start, field):
+    up, _ = stay(world, start)
+    drive = full_command(world, 1, DriveCommand(speed_m_s=jnp.full(ROVERS, 0.5), yaw_rate_rad_s=jnp.zeros(ROVERS)))
+    broken = replace(drive, **{field: getattr(drive, field).at[0].set(jnp.nan)})
+    state, _ = fly(world, start, (up, broken), 0.2)
+    assert happened(state, 1) == [{"non_finite"}, *[set()] * (ROVERS - 1)]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.groups[1].vehicle))
 
 
 def test_each_level_may_be_given_to_step_as_it_is(world, start):
