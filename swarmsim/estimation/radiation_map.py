@@ -171,7 +171,7 @@ def interpolate(params: MappingParams, measurements: Measurements, windows: jax.
     rate, noise, background, variance = _levels(params, m, jnp.where(m.valid, windows, 0.0))
     mean, var, gain, noise_var = posterior(params, m, rate, noise, background, variance)
     return RadiationMap(
-        mean_cps=mean,
+        mean_cps=jnp.maximum(mean, 0.0),  # beside a strong source the interpolation swings below nothing
         std_cps=jnp.sqrt(jnp.maximum(var, 0.0)),
         significance=_significance(mean - background, gain, noise_var, background),
         background_cps=background,

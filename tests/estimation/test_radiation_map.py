@@ -66,6 +66,17 @@ def test_the_kernel_is_the_published_one():
     np.testing.assert_allclose(matern(jnp.array(-6.0), jnp.array(6.0)), expected, rtol=1e-6)
 
 
+def test_no_rate_of_the_map_is_negative():
+    near = jnp.sum(jnp.square(COARSE_SURVEY.position_m[:, :2]), axis=1) < 8.0**2
+    strong = draw(COARSE_SURVEY, jnp.where(near, 30_000.0, 94.0), 1)
+    result = _interpolate(COARSE, strong)
+    rate, level = strong.counts / strong.exposure_s, result.background_cps
+    swings = _posterior(COARSE, strong, rate, jnp.full(240, 94.0), level, jnp.square(jnp.std(rate)))[0]
+    assert float(jnp.min(swings)) < 0.0
+    assert float(jnp.min(result.mean_cps)) == 0.0
+    assert float(jnp.max(result.mean_cps)) > 10_000.0
+
+
 def test_far_from_samples_the_map_is_background_with_the_prior_spread():
     left = replace(COARSE_SURVEY, valid=COARSE_SURVEY.position_m[:, 0] < -10.0)
     result = _interpolate(COARSE, draw(left, jnp.full(240, 94.0), 1))
