@@ -14,6 +14,7 @@ import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
 from swarmsim.config.sources import ACTIVITY_MAX_MBQ
+from swarmsim.estimation.detection_limit import NOTICED, noticed
 from swarmsim.estimation.forward import Problem, models_of, padded, trust_of
 from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.likelihood import natural_background, position_covariance
@@ -36,7 +37,6 @@ WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one a
 BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known: half of it may be missing
 CONVERGED_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
-NOTICED = 1.645  # standard deviations above what is asked of a further source: it has that with 95 % (ISO 11929)
 UNSURE = 0.25  # standard deviation of a place whose posterior could not be sampled, over the reach of the search
 
 
@@ -272,8 +272,8 @@ def localise(
             sources=replace(known.sources, place=jnp.where(there, known.sources.place, state.sources.place)),
             unknowns=replace(state.unknowns, level=known.unknowns.level, lengths=known.unknowns.lengths),
         )
-    state, seen = find_sources(problem, presumed.places, nuclides, params.search, state)
-    return _report(presumed, problem, params, state, seen)
+    state = find_sources(problem, presumed.places, nuclides, params.search, state)
+    return _report(presumed, problem, params, state)
 
 
 def nothing_found(
@@ -331,7 +331,7 @@ def sampled(
 
 
 def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
-    """Activities [...] in Bq from which on another source is noticed, by the information [...] about its activity.
+    """Activities [K] in Bq from which on another source is noticed, by the information [K] about its activity.
 
     ``further`` [] is what it must reach. Infinite where it would have to be stronger than any.
     """
@@ -339,9 +339,7 @@ def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
     return jnp.where(activity < 1e6 * ACTIVITY_MAX_MBQ, activity, jnp.inf)
 
 
-def _report(
-    presumed: Presumed, problem: Problem, params: LocalisationParams, state: State, seen: jax.Array
-) -> Estimated:  # fmt: skip
+def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Estimated:
     site, s, m = presumed.site, state.sources, problem.measurements
     posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
@@ -388,6 +386,6 @@ def _report(
         chi_squared=overall.chi_squared / overall.freedom,
         strain=strained - usual,
         windows=jnp.sum(m.valid),
-        noticed_bq=jnp.where(presumed.nuclides, noticed_from(seen, least_of(params.search, state)), jnp.inf),
+        noticed_bq=noticed(problem, presumed.places, presumed.nuclides, least_of(params.search, state), state),
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -6,6 +6,8 @@ chi-square of one degree of freedom without a source. In the open the rate of a 
 up to the direction to the crystal, so that both are matrix products: (points x windows) (windows x nuclides).
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,10 +16,10 @@ from swarmsim.device import each
 from swarmsim.estimation.forward import Problem, padded, silent
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations, of_window
 from swarmsim.pytree import on_device, pytree
-from swarmsim.radiation.detector import Detector, Source
+from swarmsim.radiation.detector import AIR, Detector, Source
 from swarmsim.radiation.ground import basis
 from swarmsim.radiation.roi_lines import roi_rates_and_slopes
-from swarmsim.site.rays import Crossed, wide
+from swarmsim.site.rays import Crossed, above_ground, mirrored, wide
 
 NODES_M = (3.0, 10.0, 30.0, 100.0)
 """Distances at which the rates are computed; rates times squared distance are linear between them."""
@@ -68,12 +70,12 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     mean, columns, of_own = model.mean.T, model.columns.T, of_window(model.columns, u.others.shape[0]).T
     own_inverse, own_push = at.own.T, at.own_push.T
     weight = jnp.where(m.valid[:, None], problem.trust / jnp.maximum(mean, MEAN_FLOOR), 0.0)
-    names, models = problem.detectors[0].material_names, problem.detector
-    air = names.index("air") if "air" in names else 0
-    kernels = [padded(open_rates(d, allowed.shape[0], air), regions) for d in problem.detectors]
+    models = problem.detector
+    kernels = [padded(open_rates(d, allowed.shape[0], _air_of(d)), regions) for d in problem.detectors]
     kernel = jnp.stack(kernels)  # [D, N, J, R]
-    share = jnp.sum(mean, axis=1) / jnp.maximum(jnp.sum(_true(problem, others, u), axis=1), 1e-9)
-    scale = m.exposure_s * share  # [n]
+    true = jnp.sum(true_counts(problem, others, u), axis=1)
+    scale = m.exposure_s * jnp.sum(mean, axis=1) / jnp.maximum(true, 1e-9)  # [n]
+    shape = scale[:, None, None, None] * jnp.einsum("nd,dcjr->ncjr", models, kernel)  # [n, N, J, R]
 
     # what is common to all windows: the others' factors and the levels
     k, d = u.others.shape[0], u.level.shape[0]
@@ -91,7 +93,6 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     still = jnp.einsum("nab,nb->na", own_inverse, own_push)
     left = weight * (m.rois - mean - jnp.einsum("nra,na->nr", of_own, still))  # [n, R]
     across = eliminated(common)  # [n, R, Q]
-    shape = scale[:, None, None, None] * jnp.einsum("nd,dcjr->ncjr", models, kernel)  # [n, N, J, R]
     pushes = jnp.einsum("ncjr,nr->ncj", shape, left)
     crossings = jnp.einsum("ncjr,nrq->ncjq", shape, across)
     inner = jnp.einsum("nra,nr,ncjr->ncja", of_own, weight, shape)
@@ -124,7 +125,32 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     )
 
 
-def _true(problem: Problem, others: Others, u: Unknowns) -> jax.Array:
+def _air_of(detector: Detector) -> int:
+    """Number of air among the materials of a detector."""
+    return detector.material_names.index(AIR) if AIR in detector.material_names else 0
+
+
+def open_counts(problem: Problem, point_m: jax.Array, nuclide: jax.Array) -> jax.Array:
+    """Counts [n, R] before dead time that a source of 1 Bq at ``point_m`` [3] adds where no wall is in the way."""
+    source = Source(position_m=point_m, activity_bq=jnp.ones(()), nuclide=nuclide)
+    parts = []
+    for first, last, number, _ in problem.spans:
+        detector, m = (
+            problem.detectors[number],
+            jax.tree.map(lambda x, part=slice(first, last): x[part], problem.measurements),
+        )
+        heights = jax.vmap(partial(above_ground, problem.site, point_m))(m.position_m)
+        ground = jax.vmap(partial(mirrored, point_m))(m.position_m, *heights)
+        distance = jnp.linalg.norm(m.position_m - point_m, axis=1)
+        length = jnp.zeros((last - first, len(detector.material_names))).at[:, _air_of(detector)].set(distance)
+        way = Crossed(length_m=length, place=jnp.full_like(length, 0.5), shape=wide(length, ground))
+        rates = roi_rates_and_slopes(detector, source, way, m.position_m, m.axis).rates
+        parts.append(padded(rates, problem.background.shape[1]) * m.exposure_s[:, None])
+    return jnp.concatenate(parts)
+
+
+def true_counts(problem: Problem, others: Others, u: Unknowns) -> jax.Array:
+    """Counts [n, R] before dead time of the background and the ``others``."""
     background = problem.background * jnp.exp(problem.detector @ u.level + u.background)[:, None]
     return background + jnp.sum(others.counts * u.others[:, None, None], axis=0) * jnp.exp(u.gain)[:, None]
 

@@ -58,17 +58,13 @@ def sought(
     slot: jax.Array,
     adding: jax.Array,
     wide: jax.Array,
-) -> tuple[State, jax.Array, jax.Array]:
-    """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one.
-
-    And what information [N] about the activity of a further one the grid tells of (`Looked`); 0 where none was
-    ``adding``.
-    """
+) -> tuple[State, jax.Array]:
+    """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one."""
     others = without(state, slot).added
-    starts, looked = for_those(
+    starts, statistic = for_those(
         adding | wide,
         lambda: starts_of(problem, places, allowed, others, state.unknowns),
-        lambda: no_starts(places, allowed.shape[0]),
+        lambda: (no_starts(places), jnp.zeros(())),
     )
 
     def look() -> tuple[State, jax.Array]:
@@ -81,9 +77,8 @@ def sought(
         after = replace(after, sources=replace(after.sources, nuclide_value=table))
         return jax.tree.map(partial(jnp.where, found), after, state), found
 
-    worth = ~adding | (looked.statistic > PROMISING * params.threshold)
-    after, found = for_those(worth, look, lambda: (state, jnp.array(False)), IN_STEP)
-    return after, found, jnp.where(adding, looked.information, 0.0)
+    worth = ~adding | (statistic > PROMISING * params.threshold)
+    return for_those(worth, look, lambda: (state, jnp.array(False)), IN_STEP)
 
 
 def least_of(params: SearchParams, state: State) -> jax.Array:

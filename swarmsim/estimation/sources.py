@@ -45,12 +45,9 @@ class _Progress:
     mixings: jax.Array  # [] int32, how often two of different nuclides may still be placed together
     made: jax.Array  # [K] bool, sources that the last division made
     closing: jax.Array  # [] bool, whether companions have been joined: no more sources are added
-    seen: jax.Array  # [N] information about the activity of a further one when that was last looked for (`Looked`)
 
 
-def find_sources(
-    problem: Problem, places: Places, allowed: jax.Array, params: SearchParams, state: State
-) -> tuple[State, jax.Array]:
+def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: SearchParams, state: State) -> State:
     """Seek the sources of ``state`` again, then add others until no further one explains the counts beyond chance.
 
     After each that is added the others are sought again. Then the one that is missed least is left out for a trial: the
@@ -64,9 +61,6 @@ def find_sources(
         allowed: [N] bool, nuclides in question.
         params: settings.
         state: what is known already (`no_sources`).
-
-    Returns the sources, and the information [N] (1/Bq^2) about the activity of a further one of each nuclide that most
-    places in the open reach (`swarmsim.estimation.starts.Looked`).
     """
     s = state.sources
     zero = jnp.zeros_like(s.joined_m)
@@ -77,20 +71,19 @@ def find_sources(
     start = _Progress(
         state=first, again=first.sources.present, wide=~no, trial=no, before=first, over=no,
         left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max), divisions=jnp.int32(DIVISIONS), closing=no,
-        mixings=jnp.int32(MIXINGS), made=jnp.zeros_like(first.sources.present), seen=jnp.zeros(allowed.shape[0]),
+        mixings=jnp.int32(MIXINGS), made=jnp.zeros_like(first.sources.present),
     )  # fmt: skip
 
     def step(p: _Progress) -> _Progress:
         adding = ~jnp.any(p.again)
         slot = jnp.where(adding, jnp.argmin(p.state.sources.present), jnp.argmax(p.again))
-        state, found, seen = sought(problem, places, allowed, params, p.state, slot, adding, p.wide)
+        state, found = sought(problem, places, allowed, params, p.state, slot, adding, p.wide)
         present = state.sources.present
         mine = jnp.arange(present.shape[0]) == slot
         again = jnp.where(adding & found, present, p.again) & ~mine
         done = ~jnp.any(again) & (found | ~adding)
         wide = p.wide & jnp.any(again) & ~adding
         p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
-        p = replace(p, seen=jnp.where(adding, seen, p.seen))
         untried = done & ~p.trial & ~p.closing & (jnp.sum(present) >= 2)
         p = _ended_trial(params.further, p, done & p.trial)
         p = _begun_trial(problem, params, p, untried)
@@ -101,8 +94,7 @@ def find_sources(
         p = replace(p, state=state, trial=p.trial & ~spent, over=p.over | full | spent)
         return _joined(problem, _divided(problem, params, p))
 
-    end = repeat_while(lambda p: ~p.over, step, start, IN_STEP)
-    return end.state, end.seen
+    return repeat_while(lambda p: ~p.over, step, start, IN_STEP).state
 
 
 def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:

@@ -22,7 +22,6 @@ APART_M = 12.0  # between those
 POINTS_MAX = 20_000  # of the grid
 ROOMS = 960  # places in buildings; the array always has as many, so that another area is only another value
 FROM_WALLS_M = 0.3  # of places in buildings
-MOST = 0.95  # of the grid's points, at which a source that is as strong as the detection limit would be noticed
 
 
 @pytree
@@ -44,14 +43,6 @@ class Starts:
     inside_m: jax.Array  # [I, 2] world, the most promising first
     inside_nuclide: jax.Array  # [I] int32
     there: jax.Array  # [I] bool
-
-
-@pytree
-class Looked:
-    """What the grid tells of a further source, wherever it may be in the open."""
-
-    statistic: jax.Array  # [] largest one
-    information: jax.Array  # [N] (1/Bq^2) about the activity of each nuclide, reached at `MOST` of the points
 
 
 def places_of(site: Site, corners_m: np.ndarray, step_m: float, height_m: float) -> Places:
@@ -105,8 +96,8 @@ def _inside(site: Site, low: np.ndarray, high: np.ndarray, step_m: float) -> np.
 
 def starts_of(
     problem: Problem, places: Places, allowed: jax.Array, others: Others, u: Unknowns
-) -> tuple[Starts, Looked]:  # fmt: skip
-    """What is tried for a source beside ``others``, and what the grid tells; ``u`` is the fit with them alone.
+) -> tuple[Starts, jax.Array]:  # fmt: skip
+    """What is tried for a source beside ``others``, and the largest statistic; ``u`` is the fit with them alone.
 
     ``allowed`` [N] are the nuclides in question. A place in a building is tried with the nuclide that explains most at
     the nearest point of the grid.
@@ -123,15 +114,13 @@ def starts_of(
         inside_nuclide=scanned.nuclide[near[order]],
         there=places.there[order],
     )
-    information = jnp.quantile(scanned.information, 1.0 - MOST, axis=0)
-    return starts, Looked(statistic=statistic[0], information=information)
+    return starts, statistic[0]
 
 
-def no_starts(places: Places, nuclides: int) -> tuple[Starts, Looked]:
+def no_starts(places: Places) -> Starts:
     """Of a search that begins where the source is."""
     count = places.there.shape[0]
-    starts = Starts(
+    return Starts(
         point_m=jnp.zeros((STARTS, 3)), nuclide=jnp.zeros(STARTS, jnp.int32),
         inside_m=jnp.zeros((count, 2)), inside_nuclide=jnp.zeros(count, jnp.int32), there=jnp.zeros(count, bool),
     )  # fmt: skip
-    return starts, Looked(statistic=jnp.zeros(()), information=jnp.zeros(nuclides))

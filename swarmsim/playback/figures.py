@@ -127,7 +127,7 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
             axes.plot(*made.hotspots_m.T, linestyle="none", marker="o", markersize=9.0, markerfacecolor="none",
                       markeredgecolor="black", markeredgewidth=1.0, label="hotspot", zorder=6)  # fmt: skip
         plan.draw_truth(axes, record)
-        plan.draw_estimate(axes, record.survey_estimate, "survey estimate, 95 % ellipse")
+        plan.draw_estimate(axes, record.survey_estimate, "survey estimate")
     std = f"median standard deviation {np.median(made.std_cps):.2g}"
     plan.colour_bar(figure, close, image, f"Count rate, interpolated [1/s]\n({std})")
     handles, _ = whole.get_legend_handles_labels()
@@ -174,7 +174,7 @@ def driven_measurements(phase: Phase, record: MissionRecord, site_model: SiteMod
             axes.plot(*path[:, :2].T, "-", color="0.45", linewidth=0.7, label=label, zorder=3)
         axes.scatter(x, y, c=rate, s=size, cmap=RATE_MAP, norm=norm, linewidths=0, zorder=5, rasterized=True)
         plan.draw_truth(axes, record)
-        plan.draw_estimate(axes, record.estimate, "final estimate, 95 % ellipse")
+        plan.draw_estimate(axes, record.estimate, "final estimate")
     bar = plan.colour_bar(figure, close, ScalarMappable(norm=norm, cmap=RATE_MAP), _RATE_LABEL)
     _plain_log_ticks(bar, norm)
     handles, _ = whole.get_legend_handles_labels()

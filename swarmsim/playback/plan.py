@@ -231,12 +231,15 @@ def draw_truth(axes: Axes, record: MissionRecord) -> None:
 
 
 def draw_estimate(axes: Axes, estimate: Estimate | None, label: str) -> None:
-    """A dot at the estimate and the ellipse that holds 95 % of its horizontal uncertainty."""
+    """A dot at the estimate and the ellipse that holds 95 % of its horizontal uncertainty, if that is known."""
     if estimate is None:
         return
     centre = estimate.position_m[:2]
+    label = f"{label}, 95 % ellipse" if estimate.errors_known else label
     axes.plot(*centre, linestyle="none", marker="o", markersize=3.0, color=ESTIMATE, markeredgecolor="white",
               markeredgewidth=0.4, label=label, zorder=8)  # fmt: skip
+    if not estimate.errors_known:
+        return
     width, height, angle = ellipse_95(estimate.covariance_m2)
     axes.add_patch(
         Ellipse(

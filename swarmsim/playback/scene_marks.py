@@ -110,18 +110,20 @@ def _pin(
 
 
 def _estimate(stream: rr.RecordingStream, path: str, estimate: Estimate, name: str, colour: str) -> None:
-    half_sizes, quaternion = ellipsoid(estimate.covariance_m2)
-    stream.log(
-        f"world/{path}/ellipsoid",
-        rr.Ellipsoids3D(
-            centers=[estimate.position_m],
-            half_sizes=[half_sizes],
-            quaternions=[rr.Quaternion(xyzw=quaternion)],
-            colors=[rgba(colour, 110)],
-            fill_mode="solid",
-        ),
-    )
-    label = f"{name} estimate, {estimate.activity_mbq:.0f} ± {estimate.activity_std_mbq:.0f} MBq"
+    if estimate.errors_known:
+        half_sizes, quaternion = ellipsoid(estimate.covariance_m2)
+        stream.log(
+            f"world/{path}/ellipsoid",
+            rr.Ellipsoids3D(
+                centers=[estimate.position_m],
+                half_sizes=[half_sizes],
+                quaternions=[rr.Quaternion(xyzw=quaternion)],
+                colors=[rgba(colour, 110)],
+                fill_mode="solid",
+            ),
+        )
+    std = f" ± {estimate.activity_std_mbq:.0f}" if estimate.errors_known else ""
+    label = f"{name} estimate, {estimate.activity_mbq:.0f}{std} MBq"
     _pin(stream, path, estimate.position_m, 15.0, label, colour, static=False)
 
 

@@ -38,6 +38,10 @@ def story(record: MissionRecord) -> list[tuple[float, str, str]]:
 def describe(estimate: Estimate) -> str:
     """An estimate in a few words: place and activity, each with one standard deviation."""
     (x, y, z), (sx, sy, sz) = estimate.position_m, np.sqrt(np.diag(estimate.covariance_m2))
+    if not estimate.errors_known:
+        return (
+            f"{x:.0f} m east, {y:.0f} m north, {z:.0f} m up, about {estimate.activity_mbq:.0f} MBq {estimate.nuclide}"
+        )
     return (
         f"{x:.2f} ± {sx:.2f} m east, {y:.2f} ± {sy:.2f} m north, {z:.2f} ± {sz:.2f} m up, "
         f"{estimate.activity_mbq:.1f} ± {estimate.activity_std_mbq:.1f} MBq {estimate.nuclide}"

@@ -1,5 +1,6 @@
 """One mission out of a batch, as the record on the host that files, figures and recordings are made from."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -73,6 +74,10 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     verdict = None
     if conclusion is not None and chart is not None:
         verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, telling, examined or 0, end)
+        if verdict.status == "saturated":
+            surveyed, final = (
+                tuple(replace(one, errors_known=False) for one in several) for several in (surveyed, final)
+            )
     events = sorted(_events(simulation, end, phases), key=lambda event: event.time_s)
     return MissionRecord(
         name=simulation.scenario.mission.name,

@@ -6,8 +6,8 @@ from types import MappingProxyType
 
 import numpy as np
 
+from swarmsim.estimation.detection_limit import MOST
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
-from swarmsim.estimation.starts import MOST
 from swarmsim.results.record import Estimate, Spectrum
 from swarmsim.results.status import CONFIRMED, Verdict, in_mbq
 
@@ -75,6 +75,8 @@ def _noticed(noticed_mbq: Mapping[str, float]) -> str:
 
 def _placed(estimate: Estimate) -> str:
     x, y = estimate.position_m[:2]
+    if not estimate.errors_known:
+        return f"about {in_mbq(estimate.activity_mbq)} {estimate.nuclide} near ({x:.0f}, {y:.0f})"
     # one standard deviation, in the direction in which it is largest
     (xx, xy), (_, yy) = np.asarray(estimate.covariance_m2, float)[:2, :2]
     std = math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))

@@ -118,6 +118,7 @@ class Estimate:
     detection: float = np.inf  # twice the logarithm of the likelihood ratio against the same without it
     effective_samples: float = np.inf  # independent places that the posterior's weighted ones are worth
     converged: bool = True  # those are enough, and two halves of them agree
+    errors_known: bool = True  # not where a counter was saturated: standard deviations are then left out of all results
     joined_m: float = 0.0  # so far off another one of its nuclide would explain the counts better; 0: none
     beside_mbq: float = np.inf
     """Activity from which on another one of its nuclide, 3 to 12 m off, would have been noticed with 95 %, at nine of

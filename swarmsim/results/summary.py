@@ -209,7 +209,7 @@ def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[s
     several sources, so near to one another; ``beside_noticed_mbq`` is the activity from which on another one of its
     nuclide, 3 to 12 m off, would have been noticed (`Estimate.beside_mbq`). Dose rates 1 m from the source are those of
     its activity with nothing around it; their standard deviations are the activity's, for the nuclide that was
-    estimated.
+    estimated. Where a counter was saturated no standard deviation can be stated: they are None.
     """
     if estimate is None:
         return dict.fromkeys(_ESTIMATE_KEYS)
@@ -217,26 +217,27 @@ def estimate_summary(estimate: Estimate | None, record: MissionRecord) -> dict[s
     position = np.asarray(estimate.position_m, float)
     nearest, error = nearest_of(position, sources)
     activity = float(estimate.activity_mbq)
+    known = estimate.errors_known
     values = (
         estimate.nuclide,
         plain(position),
-        plain(np.sqrt(np.maximum(np.diag(estimate.covariance_m2), 0.0))),
-        np.asarray(estimate.covariance_m2, float).tolist(),
+        plain(np.sqrt(np.maximum(np.diag(estimate.covariance_m2), 0.0))) if known else None,
+        np.asarray(estimate.covariance_m2, float).tolist() if known else None,
         error,
         nearest_of(position[:2], sources)[1],
         None if nearest is None else nearest.nuclide,
         activity,
-        float(estimate.activity_std_mbq),
+        float(estimate.activity_std_mbq) if known else None,
         None
         if nearest is None or nearest.activity_mbq <= 0.0
         else 100.0 * abs(activity - float(nearest.activity_mbq)) / float(nearest.activity_mbq),
         float(estimate.background_scale),
         float(estimate.joined_m) or None,
-        float(estimate.beside_mbq) if np.isfinite(estimate.beside_mbq) else None,
+        float(estimate.beside_mbq) if known and np.isfinite(estimate.beside_mbq) else None,
         None if at_1_m is None else at_1_m.ambient_usv_h * activity,
-        None if at_1_m is None else at_1_m.ambient_usv_h * float(estimate.activity_std_mbq),
+        None if at_1_m is None or not known else at_1_m.ambient_usv_h * float(estimate.activity_std_mbq),
         None if at_1_m is None else at_1_m.kerma_ugy_h * activity,
-        None if at_1_m is None else at_1_m.kerma_ugy_h * float(estimate.activity_std_mbq),
+        None if at_1_m is None or not known else at_1_m.kerma_ugy_h * float(estimate.activity_std_mbq),
     )
     return dict(zip(_ESTIMATE_KEYS, values, strict=True))
 

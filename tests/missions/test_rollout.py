@@ -128,8 +128,8 @@ def test_no_activity_is_a_clear_finding(simulation):
     assert jax.tree.structure(silent.world) == jax.tree.structure(world)
     record = swarmsim.mission_record(silent, silent.rollout(1), 0)
     assert record.finding.startswith("no source above background (in the open, over 95% of the survey area, one would")
-    # of those of 40 MBq in the open nine of ten are found
-    assert 20.0 < record.noticed_mbq["Co-60"] < 40.0
+    # of those of 40 MBq in the open nine of ten are found: those at the weakest places are not
+    assert 25.0 < record.noticed_mbq["Co-60"] < 55.0
     assert record.noticed_mbq["Pu-239"] > 100.0 * record.noticed_mbq["Co-60"]
     assert set(record.noticed_mbq) == set(silent.plan.detectors[0].nuclide_names)
     assert record.estimate is None

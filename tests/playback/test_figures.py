@@ -132,6 +132,15 @@ def test_counts_above_the_pads_do_not_set_the_scale_of_a_survey(found: MissionRe
     assert away_from_pads(dataclasses.replace(found, vehicles=(still,)), own).all()  # rather than nothing
 
 
+def test_an_estimate_whose_errors_are_not_known_has_no_ellipse(found: MissionRecord, site: SiteModel) -> None:
+    assert found.survey_estimate is not None
+    doubtful = dataclasses.replace(found.survey_estimate, errors_known=False)
+    figure = figures.radiation_map(dataclasses.replace(found, survey_estimate=doubtful), site)
+    for axes in figure.axes[:2]:
+        assert not [p for p in axes.patches if isinstance(p, Ellipse)]
+    assert "survey estimate" in labels(figure.axes[0])
+
+
 def test_ellipse_holds_95_percent_of_a_normal_distribution(found: MissionRecord) -> None:
     assert found.survey_estimate is not None
     covariance = found.survey_estimate.covariance_m2

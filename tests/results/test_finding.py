@@ -27,6 +27,15 @@ def test_nothing_sought_and_nothing_found():
     assert finding(replace(SURE, status="none"), (), None, hindrance=None, presumed=False) == NOTHING_FOUND
 
 
+def test_a_saturated_counter_s_answer_has_no_standard_deviations():
+    verdict = replace(SURE, status="saturated", reasons=("a counter was driven into its dead time",))
+    told = finding(verdict, (replace(ONE[0], errors_known=False),), None, None, True)
+    assert told.startswith("saturated: a source of about ")
+    assert "±" not in told
+    assert "noticed" not in told
+    assert "±" in finding(SURE, ONE, None, None, True)
+
+
 @pytest.mark.parametrize(
     ("limits", "said"),
     [

@@ -99,6 +99,28 @@ def test_overlapping_phases_are_simulated_once(found: MissionRecord) -> None:
     assert summary(dataclasses.replace(found, phases=two), TIMINGS)["real_time_factor"] == pytest.approx(120.0 / 4.0)
 
 
+def test_where_a_counter_was_saturated_no_standard_deviation_is_stated(found: MissionRecord) -> None:
+    estimate = dataclasses.replace(found.estimate, errors_known=False)
+    made = summary(dataclasses.replace(found, estimate=estimate, status="saturated"), TIMINGS)["source"]
+    known = summary(found, TIMINGS)["source"]
+    left_out = {"position_std_m", "position_covariance_m2", "activity_std_mbq", "dose_rate_1m_std_usv_h"}
+    left_out |= {"kerma_rate_1m_std_ugy_h", "beside_noticed_mbq"}
+    assert {key for key in known if known[key] != made[key]} <= left_out
+    assert all(made[key] is None for key in left_out)
+    row = batch_row(dataclasses.replace(found, estimate=estimate))
+    assert row["source_std_east_m"] is None
+    assert row["source_covariance_east_north_m2"] is None
+    assert row["source_east_m"] == pytest.approx(known["position_m"][0])
+
+
+def test_what_would_have_been_noticed_is_told_by_nuclide(found: MissionRecord) -> None:
+    noticed = dataclasses.replace(found, noticed_mbq={"Co-60": 30.0, "Cs-137": 70.0, "Pu-239": np.inf})
+    assert summary(noticed, TIMINGS)["noticed_mbq"] == {"Co-60": 30.0, "Cs-137": 70.0, "Pu-239": None}
+    row = batch_row(noticed)
+    assert (row["noticed_least_mbq"], row["noticed_most_mbq"]) == (30.0, 70.0)
+    assert batch_row(found)["noticed_least_mbq"] is None
+
+
 def test_every_key_that_users_rely_on(found: MissionRecord) -> None:
     made = summary(found, TIMINGS)
     assert list(made["phases"]) == ["survey", "search"]

@@ -1,0 +1,76 @@
+"""How strong a source would have had to be to be noticed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from swarmsim.estimation.detection_limit import MOST, limits, noticed
+from swarmsim.estimation.localise import problem_of
+from swarmsim.estimation.scan import scan
+from swarmsim.estimation.search import attempt
+from swarmsim.estimation.state import no_sources, settled
+from tests.estimation.survey import NUCLIDES, counted, mean_rois, place, presumed, spectrometer, survey
+
+CO_60 = NUCLIDES.index("Co-60")
+DETECTORS = (spectrometer(),)
+FLIGHT = survey(altitude=12.0, count=60, half=40.0, lines=6)
+SPANS = ((0, 60, 0, 1),)
+SITE = place(half=40.0)
+KNOWN = presumed(SITE, DETECTORS, half=40.0)
+ASKED = jnp.float32(5.5**2)
+BACKGROUND = np.asarray(mean_rois(SITE, DETECTORS, FLIGHT))
+ALL = jnp.ones(len(NUCLIDES), bool)
+
+
+def _nothing(rois):
+    problem = problem_of(KNOWN, counted(FLIGHT, rois), SPANS)
+    return problem, settled(problem, no_sources(problem, 1, len(NUCLIDES)))
+
+
+@jax.jit
+def _limits(rois, point):
+    problem, state = _nothing(rois)
+    return limits(problem, state, jnp.broadcast_to(point, (len(NUCLIDES), 3)), ASKED)
+
+
+@jax.jit
+def _ratio(rois, point):
+    """Twice the logarithm of the likelihood ratio that a search would find at the place of the source."""
+    problem, state = _nothing(rois)
+    at = point.at[2].set(1.0)
+    fit = attempt(problem, jnp.int32(CO_60), state.added, state.unknowns, at).fit
+    return 2.0 * (fit.likelihood - state.likelihood)
+
+
+@pytest.mark.parametrize("at", [(10.0, 4.0, 1.0), (-33.0, 28.0, 1.0), (39.0, -39.0, 1.0)])
+def test_a_source_at_its_detection_limit_is_noticed_nineteen_times_of_twenty(at):
+    point = jnp.array(at)
+    per_bq = (np.asarray(mean_rois(SITE, DETECTORS, FLIGHT, [(at, 1e6, "Co-60")])) - BACKGROUND) / 1e6
+    rng = np.random.default_rng(0)
+    background = BACKGROUND * np.exp(float(KNOWN.background_std) * rng.standard_normal((300, 60, 1)))
+    silent = jnp.float32(rng.poisson(background))
+    activity = np.asarray(jax.lax.map(lambda rois: _limits(rois, point)[CO_60], silent))
+    added = jnp.float32(rng.poisson(np.maximum(activity[:, None, None] * per_bq, 0.0)))
+    ratio = np.asarray(jax.lax.map(lambda rois: _ratio(rois, point), silent + added))
+    assert 0.85 < np.mean(ratio > ASKED) < 0.99
+
+
+def test_most_places_reach_the_limit_that_is_told():
+    @jax.jit
+    def told(rois, allowed):
+        problem, state = _nothing(rois)
+        every = scan(problem, KNOWN.places.points_m, allowed, state.added, state.unknowns).information[:, CO_60]
+        return noticed(problem, KNOWN.places, allowed, ASKED, state), every
+
+    (whole, every), (one, _) = told(BACKGROUND, ALL), told(BACKGROUND, jnp.arange(len(NUCLIDES)) == CO_60)
+    # a faint source would be noticed there from so many standard deviations on
+    faint = (np.sqrt(float(ASKED)) + norm.ppf(0.95)) / np.sqrt(np.asarray(every))
+    assert np.mean(faint < whole[CO_60]) > MOST - 0.01
+    assert np.isfinite(whole).all()
+    assert one[CO_60] == pytest.approx(float(whole[CO_60]), rel=1e-4)
+    assert np.isinf(np.delete(np.asarray(one), CO_60)).all()
+    # where nothing was measured, nothing would have been noticed
+    dark, _ = told(jnp.zeros_like(jnp.asarray(BACKGROUND)), ALL)
+    assert np.isfinite(dark).all() or np.isinf(dark).any()
