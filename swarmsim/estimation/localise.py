@@ -14,6 +14,7 @@ import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
 from swarmsim.config.sources import ACTIVITY_MAX_MBQ
+from swarmsim.device import some_at_a_time
 from swarmsim.estimation.detection_limit import NOTICED, noticed
 from swarmsim.estimation.forward import Problem, models_of, padded, trust_of
 from swarmsim.estimation.importance_sampling import Posterior
@@ -386,6 +387,8 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         chi_squared=overall.chi_squared / overall.freedom,
         strain=strained - usual,
         windows=jnp.sum(m.valid),
-        noticed_bq=noticed(problem, presumed.places, presumed.nuclides, least_of(params.search, state), state),
+        noticed_bq=some_at_a_time(
+            lambda: noticed(problem, presumed.places, presumed.nuclides, least_of(params.search, state), state)
+        ),
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -133,20 +133,18 @@ def _air_of(detector: Detector) -> int:
 def open_counts(problem: Problem, point_m: jax.Array, nuclide: jax.Array) -> jax.Array:
     """Counts [n, R] before dead time that a source of 1 Bq at ``point_m`` [3] adds where no wall is in the way."""
     source = Source(position_m=point_m, activity_bq=jnp.ones(()), nuclide=nuclide)
-    parts = []
+    position, parts = problem.measurements.position_m, []
+    heights = jax.vmap(partial(above_ground, problem.site, point_m))(position)
+    ground = jax.vmap(partial(mirrored, point_m))(position, *heights)
+    distance = jnp.linalg.norm(position - point_m, axis=1)
     for first, last, number, _ in problem.spans:
-        detector, m = (
-            problem.detectors[number],
-            jax.tree.map(lambda x, part=slice(first, last): x[part], problem.measurements),
-        )
-        heights = jax.vmap(partial(above_ground, problem.site, point_m))(m.position_m)
-        ground = jax.vmap(partial(mirrored, point_m))(m.position_m, *heights)
-        distance = jnp.linalg.norm(m.position_m - point_m, axis=1)
-        length = jnp.zeros((last - first, len(detector.material_names))).at[:, _air_of(detector)].set(distance)
-        way = Crossed(length_m=length, place=jnp.full_like(length, 0.5), shape=wide(length, ground))
-        rates = roi_rates_and_slopes(detector, source, way, m.position_m, m.axis).rates
-        parts.append(padded(rates, problem.background.shape[1]) * m.exposure_s[:, None])
-    return jnp.concatenate(parts)
+        own, detector = slice(first, last), problem.detectors[number]
+        length = jnp.zeros((last - first, len(detector.material_names)))
+        length = length.at[:, _air_of(detector)].set(distance[own])
+        way = Crossed(length_m=length, place=jnp.full_like(length, 0.5), shape=wide(length, ground[own]))
+        rates = roi_rates_and_slopes(detector, source, way, position[own], problem.measurements.axis[own]).rates
+        parts.append(padded(rates, problem.background.shape[1]))
+    return jnp.concatenate(parts) * problem.measurements.exposure_s[:, None]
 
 
 def true_counts(problem: Problem, others: Others, u: Unknowns) -> jax.Array:
