@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import swarmsim
-from experiments.validation import pairs
+from experiments.validation import detection, pairs
 from experiments.validation.missions import by_survey, matches, rows_of, summarised, without_sources
 
 ASKED = (30.0, 60.0)
@@ -167,6 +167,18 @@ def test_shares_are_of_those_that_they_speak_of():
     assert told["detectable_and_resolved"] == 3
     assert told["of_those_number_right"] == pytest.approx(2 / 3)
     assert told["of_those_located"] == pytest.approx(2 / 3)
+
+
+def test_what_was_noticed_is_counted_by_times_the_limit():
+    near, far = record([source(0.0)], [estimate(3.0)]), record([source(0.0)], [estimate(40.0)])
+    rows = [detection.row_of(one, times, 30.0) for times in (0.5, 1.0) for one in (near, far)]
+    rows.append(detection.row_of(record([source(0.0)], [], "none"), 0.5, 30.0))
+    assert [row["noticed"] for row in rows] == [True, False, True, False, False]
+    assert rows[-1]["error_m"] is None
+    told = detection.summarised(rows, np.array([30.0, 50.0]))
+    assert told["limit_mbq"] == {"median": 40.0, "max": 50.0}
+    assert told["by_times_the_limit"]["0.5"] == {"missions": 3, "noticed": 1, "share": pytest.approx(0.333)}
+    assert told["by_times_the_limit"]["1.0"]["share"] == 0.5
 
 
 def test_a_familywithout_sources_draws_everything_else_as_before():
