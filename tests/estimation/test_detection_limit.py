@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from swarmsim.device import some_at_a_time
 from swarmsim.estimation.detection_limit import MOST, limits, noticed
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.scan import scan
@@ -74,3 +75,17 @@ def test_most_places_reach_the_limit_that_is_told():
     # where nothing was measured, nothing would have been noticed
     dark, _ = told(jnp.zeros_like(jnp.asarray(BACKGROUND)), ALL)
     assert np.isfinite(dark).all() or np.isinf(dark).any()
+
+
+def test_an_accelerator_tells_the_same_limits_of_many_missions(monkeypatch):
+    def told(rois):
+        problem, state = _nothing(rois)
+        return some_at_a_time(lambda: noticed(problem, KNOWN.places, ALL, ASKED, state))
+
+    rng = np.random.default_rng(1)
+    drawn = jnp.float32(rng.poisson(BACKGROUND * rng.uniform(0.5, 2.0, (3, 1, 1))))
+    one_by_one = np.asarray(jax.lax.map(told, drawn))
+    monkeypatch.setattr("swarmsim.device.on_processor", lambda: False)
+    together = jax.jit(jax.vmap(told))(drawn)
+    np.testing.assert_allclose(together, one_by_one, rtol=1e-3)
+    assert np.ptp(one_by_one[:, CO_60]) > 0.1 * one_by_one[:, CO_60].mean()
