@@ -5,8 +5,8 @@
 
 The missions of ``recon``, with one source in the open. Each is flown without it, which tells the limit that holds at
 95 % of the survey area (`swarmsim.estimation.detection_limit`), and with it at several times that limit. Places are
-drawn all over the site, or, with ``--weakest``, from the tenth of the survey area that is farthest from where anything
-was measured. Writes ``detection.csv`` (a row for each mission and activity) and ``summary.json``.
+drawn all over the site, or, with ``--weakest``, the tenth of them that is farthest from where anything was measured.
+Writes ``detection.csv`` (a row for each mission and activity) and ``summary.json``.
 """
 
 import argparse
@@ -26,7 +26,7 @@ TIMES = (0.5, 0.7, 1.0, 1.4)  # the limit
 NEAR_M = 25.0  # an estimate farther away is of no source
 BACKGROUND = "vary.background.scale={uniform: [0.8, 1.2]}"
 PLACE = "vary.sources.0.position_m={place: {region: [open], margin_m: 0.5}}"
-WEAK_SHARE = 0.1
+POOL, WEAK_SHARE = 500, 0.1  # places that are drawn, and those of them that are farthest from where was measured
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     limits = np.array([record.noticed_mbq[options.nuclide] for record in silent])
     places = {}
     if options.weakest:
-        places = {"sources.0.position_m": _weak_places(silent, np.random.default_rng(options.seed))}
+        places = {"sources.0.position_m": _weak_places(simulation, silent)}
     rows = []
     for times in TIMES:
         flown = _flown(simulation, seeds, {"sources.0.activity_mbq": (times * limits).tolist()} | places)
@@ -68,18 +68,15 @@ def _flown(simulation: Any, seeds: range, values: dict[str, Any]) -> list[Missio
     return [swarmsim.mission_record(simulation, batch, i) for i in range(len(seeds))]
 
 
-def _weak_places(silent: Sequence[MissionRecord], rng: np.random.Generator) -> list[list[float]]:
-    """A place [2] for each mission, of the cells of its map that are farthest from its measurements."""
+def _weak_places(simulation: Any, silent: Sequence[MissionRecord]) -> list[list[float]]:
+    """A place [2] for each mission, of those drawn in the open the ones farthest from its measurements."""
+    drawn = simulation.draw(range(POOL)).values["sources.0.position_m"]
+    pool = np.array([np.asarray(place, float)[:2] for place in drawn])
     places = []
-    for record in silent:
-        chart = record.map
-        assert chart is not None
-        ny, nx = chart.mean_cps.shape
-        x, y = (chart.origin_m[k] + chart.cell_m * np.arange(count) for k, count in enumerate((nx, ny)))
-        cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        apart = cKDTree(np.asarray(record.samples.position_m, float)[:, :2]).query(cells)[0]
-        far = np.argsort(-apart)[: max(1, int(WEAK_SHARE * len(cells)))]
-        places.append(cells[rng.choice(far)].tolist())
+    for number, record in enumerate(silent):
+        apart = cKDTree(np.asarray(record.samples.position_m, float)[:, :2]).query(pool)[0]
+        far = np.argsort(-apart)[: max(1, int(WEAK_SHARE * POOL))]
+        places.append(pool[far[number % len(far)]].tolist())
     return places
 
 

@@ -115,12 +115,16 @@ def flown_measurements(phase: Phase, record: MissionRecord, site_model: SiteMode
 
 
 def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
-    """The interpolated map with contours, hotspots, truth and the estimate made with it; whole and close up."""
+    """The interpolated map with contours, hotspots, truth and the estimate of then; what was found close up too."""
     made = record.map
     assert made is not None
-    centre, half = _close_up(record.survey_estimate, made.hotspots_m, site_model)
-    figure, whole, close = plan.new_pair(site_model, centre, half)
-    for axes in (whole, close):
+    if record.survey_estimate is None and not len(made.hotspots_m):
+        figure, whole = plan.new_plan(site_model)
+        shown = [whole]
+    else:
+        figure, *shown = plan.new_pair(site_model, *_close_up(record.survey_estimate, made.hotspots_m, site_model))
+        whole = shown[0]
+    for axes in shown:
         image = _draw_map(axes, made)
         plan.outline_site(axes, site_model)
         if len(made.hotspots_m):
@@ -129,7 +133,7 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
         plan.draw_truth(axes, record)
         plan.draw_estimate(axes, record.survey_estimate, "survey estimate")
     std = f"median standard deviation {np.median(made.std_cps):.2g}"
-    plan.colour_bar(figure, close, image, f"Count rate, interpolated [1/s]\n({std})")
+    plan.colour_bar(figure, shown[-1], image, f"Count rate, interpolated [1/s]\n({std})")
     handles, _ = whole.get_legend_handles_labels()
     plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="obstacles")])
     return figure

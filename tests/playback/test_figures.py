@@ -281,12 +281,17 @@ def test_written_at_300_dpi(found: MissionRecord, site: SiteModel, tmp_path: Pat
 def test_mission_without_a_source(nothing: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
     written = figures.write(nothing, site, tmp_path)
     assert [path.stem for path in written] == ["trajectories", "measurements_survey", "radiation_map"]
-    whole = figures.radiation_map(nothing, site).axes[0]
+    whole, *others = figures.radiation_map(nothing, site).axes
     assert labels(whole) == ["obstacles"]
-    # An even map is one colour, and the same in both panels.
-    first, second = (axes.images[-1] for axes in whole.figure.axes[:2])
-    assert first.norm.vmin == second.norm.vmin
-    assert first.norm.vmax == second.norm.vmax
+    assert (*whole.get_xlim(), *whole.get_ylim()) == pytest.approx((-75, 75, -60, 60))
+    # an even map is one colour; there is nothing to show close up
+    assert whole.images[-1].norm.vmax > whole.images[-1].norm.vmin
+    assert len(others) == 1  # the colour bar
+    assert nothing.map is not None
+    hotspot = dataclasses.replace(nothing.map, hotspots_m=np.array([[20.0, 10.0]]))
+    both = figures.radiation_map(dataclasses.replace(nothing, map=hotspot), site).axes
+    first, second = (axes.images[-1] for axes in both[:2])
+    assert (first.norm.vmin, first.norm.vmax) == (second.norm.vmin, second.norm.vmax)
 
 
 def test_flat_site_without_buildings_and_a_lost_vehicle(found: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
