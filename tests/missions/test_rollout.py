@@ -122,6 +122,16 @@ def test_seeds_differ(records):
     assert np.mean(first[:count] != second[:count]) > 0.5
 
 
+def test_where_a_counter_was_saturated_no_errors_are_stated(simulation, batch, monkeypatch):
+    monkeypatch.setattr("swarmsim.results.status.SATURATED_SHARE", 1e-6)
+    record = swarmsim.mission_record(simulation, batch, 0)
+    assert record.status == "saturated"
+    assert record.estimates
+    assert record.survey_estimates
+    assert not any(one.errors_known for one in (*record.estimates, *record.survey_estimates))
+    assert "±" not in record.finding
+
+
 def test_no_activity_is_a_clear_finding(simulation):
     world = simulation.world
     silent = swarmsim.build(swarmsim.load("recon", (*RECON, "sources.0.activity_mbq=0")))
