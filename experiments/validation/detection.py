@@ -45,7 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     simulation = swarmsim.build(swarmsim.load("recon", (PLACE, BACKGROUND, nuclide, *options.set)))
     seeds = range(options.seed, options.seed + options.missions)
     silent = _flown(simulation, seeds, {"sources.0.activity_mbq": [0.0] * len(seeds)})
-    limits = np.array([record.noticed_mbq[options.nuclide] for record in silent])
+    limits = np.array([record.noticed_mbq.get(options.nuclide, np.inf) for record in silent])
+    if not np.all(np.isfinite(limits)):
+        parser.error(f"argument --nuclide: {options.nuclide} of no activity would be noticed in these missions")
     places = {}
     if options.weakest:
         places = {"sources.0.position_m": _weak_places(simulation, silent)}

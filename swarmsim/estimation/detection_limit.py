@@ -28,8 +28,8 @@ TOGETHER = 8  # nuclides that an accelerator looks at side by side
 
 
 @pytree
-class Silence:
-    """What was counted without the source in question; n windows, R regions."""
+class Null:
+    """The null hypothesis: what is counted without the source in question; n windows, R regions."""
 
     background: jax.Array  # [n, R] counts of it that are registered
     rest: jax.Array  # [n, R] those of the sources that are known
@@ -63,7 +63,7 @@ def limits(problem: Problem, state: State, points_m: jax.Array, asked: jax.Array
     background_variance, of_gain = model.variance
     # Student's t of a window's gain, about its middle: see `normal_equations`
     of_gain = of_gain * problem.tail / (problem.tail + 1.0)
-    silence = Silence(
+    null = Null(
         background=share * background,
         rest=share * (true - background),
         trust=jnp.where(problem.measurements.valid[:, None], problem.trust, 0.0),
@@ -77,10 +77,10 @@ def limits(problem: Problem, state: State, points_m: jax.Array, asked: jax.Array
 
     def of(one: tuple[jax.Array, jax.Array]) -> jax.Array:
         added = share_of_sum * open_counts(problem, *one)
-        faint, levelled = information_of(silence, added)
+        faint, levelled = information_of(null, added)
 
         def step(_: int, activity: jax.Array) -> jax.Array:
-            root = jnp.sqrt(jnp.maximum(levelled * ratio(silence, activity * added), 0.0))
+            root = jnp.sqrt(jnp.maximum(levelled * ratio(null, activity * added), 0.0))
             # a faint signal may be lost in what windows deviate by already
             return activity * jnp.minimum(reach / jnp.maximum(root, 1e-9), FASTEST)
 
@@ -89,28 +89,28 @@ def limits(problem: Problem, state: State, points_m: jax.Array, asked: jax.Array
     return each(of, (points_m, jnp.arange(points_m.shape[0])), TOGETHER)
 
 
-def ratio(silence: Silence, signal: jax.Array) -> jax.Array:
+def ratio(null: Null, signal: jax.Array) -> jax.Array:
     """Twice the logarithm of the likelihood ratio [] of counts that have a ``signal`` [n, R], as they are expected."""
-    counts = jnp.maximum(silence.background + silence.rest + signal, MEAN_FLOOR)
-    without, with_ = (unexplained(silence, rest, counts) for rest in (silence.rest, silence.rest + signal))
+    counts = jnp.maximum(null.background + null.rest + signal, MEAN_FLOOR)
+    without, with_ = (unexplained(null, rest, counts) for rest in (null.rest, null.rest + signal))
     return jnp.sum(without - with_)
 
 
-def unexplained(silence: Silence, rest: jax.Array, counts: jax.Array) -> jax.Array:
+def unexplained(null: Null, rest: jax.Array, counts: jax.Array) -> jax.Array:
     """Twice the logarithm of the posterior [n] that is missing to one which has exactly the ``counts`` [n, R].
 
     The background of each window and the gain of the ``rest`` [n, R] are fitted.
     """
-    before, (p, q) = jnp.stack([silence.deviation, silence.gain]), silence.precision
+    before, (p, q) = jnp.stack([null.deviation, null.gain]), null.precision
 
     def parts(own: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         changed = jnp.exp(own - before)[..., None]
-        background, others = silence.background * changed[0], rest * changed[1]
+        background, others = null.background * changed[0], rest * changed[1]
         return background, others, jnp.maximum(background + others, MEAN_FLOOR)
 
     def step(_: int, own: jax.Array) -> jax.Array:
         background, others, mean = parts(own)
-        left, weight = silence.trust * (counts / mean - 1.0), silence.trust / mean
+        left, weight = null.trust * (counts / mean - 1.0), null.trust / mean
         a = jnp.sum(weight * background * background, axis=1) + p
         b = jnp.sum(weight * background * others, axis=1)
         d = jnp.sum(weight * others * others, axis=1) + q
@@ -127,24 +127,24 @@ def unexplained(silence: Silence, rest: jax.Array, counts: jax.Array) -> jax.Arr
     more = jnp.where(little, 0.0, gap)
     missed = jnp.where(little, gap * gap / mean, 2.0 * (counts * jnp.log1p(more / mean) - more))
     held = p * (jnp.square(own[0]) - jnp.square(before[0])) + q * (jnp.square(own[1]) - jnp.square(before[1]))
-    return jnp.sum(silence.trust * missed, axis=1) + held
+    return jnp.sum(null.trust * missed, axis=1) + held
 
 
-def information_of(silence: Silence, added: jax.Array) -> tuple[jax.Array, jax.Array]:
+def information_of(null: Null, added: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Information [] (1/Bq^2) about the activity of a faint source that adds ``added`` [n, R] per Bq.
 
     The windows' backgrounds and gains are not known. And the share [] of it that is left where the levels of the
     detector models are not known either.
     """
-    weight = silence.trust / jnp.maximum(silence.background + silence.rest, MEAN_FLOOR)
+    weight = null.trust / jnp.maximum(null.background + null.rest, MEAN_FLOOR)
 
     def product(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.sum(weight * a * b, axis=1)
 
-    background, rest = silence.background, silence.rest
+    background, rest = null.background, null.rest
     levels, crossing = product(background, background), product(background, rest)
     by_background, by_rest = product(background, added), product(rest, added)
-    a, d = levels + silence.precision[0], product(rest, rest) + silence.precision[1]
+    a, d = levels + null.precision[0], product(rest, rest) + null.precision[1]
     determinant = a * d - crossing * crossing
 
     def eliminated(x: tuple[jax.Array, jax.Array], y: tuple[jax.Array, jax.Array]) -> jax.Array:
@@ -153,7 +153,7 @@ def information_of(silence: Silence, added: jax.Array) -> tuple[jax.Array, jax.A
 
     source, level = (by_background, by_rest), (levels, crossing)
     own = jnp.sum(product(added, added) - eliminated(source, source))
-    both = silence.detector.T @ (by_background - eliminated(source, level))
-    alone = silence.detector.T @ (levels - eliminated(level, level)) + LOOSE
+    both = null.detector.T @ (by_background - eliminated(source, level))
+    alone = null.detector.T @ (levels - eliminated(level, level)) + LOOSE
     left = own - jnp.sum(jnp.square(both) / alone)
     return own, jnp.clip(left / jnp.maximum(own, 1e-37), 0.0, 1.0)

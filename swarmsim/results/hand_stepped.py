@@ -15,10 +15,10 @@ import numpy as np
 from swarmsim.missions.state import Track
 from swarmsim.pytree import pytree
 from swarmsim.results.departures import departures_of
-from swarmsim.results.extract import CROWDED, gamma_constants
+from swarmsim.results.extract import CROWDED
 from swarmsim.results.record import Event, MissionRecord, Phase, VehicleRecord
 from swarmsim.results.samples import READ, measured_rows, samples_of, windows_of
-from swarmsim.results.sources import true_sources
+from swarmsim.results.sources import gamma_constants, true_sources
 from swarmsim.results.tracks import TRACK, losses, place_of, vehicle_record
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.sensors.radiation import Reading

@@ -1,11 +1,12 @@
-"""The true sources of a mission, from the points of its world."""
+"""The true sources of a mission, from the points of its world; and what sources give 1 m away."""
 
 from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
-from swarmsim.results.record import Floats, TrueSource, VehicleRecord, carried_m
+from swarmsim.radiation.dose import gamma_constant
+from swarmsim.results.record import Estimate, Floats, GammaConstant, TrueSource, VehicleRecord, carried_m
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.world.build import grouped
 from swarmsim.world.model import World
@@ -47,3 +48,12 @@ def _carrier(simulation: Simulation, world: World, point: int) -> int:
     assert world.emission.carrier is not None
     row = int(world.emission.carrier[point - len(world.emission.number)])
     return [number for members in grouped(simulation.scenario) for number in members][row]
+
+
+def gamma_constants(simulation: Simulation, sources: tuple[Estimate | TrueSource, ...]) -> dict[str, GammaConstant]:
+    """Gamma constants of the nuclides of ``sources``."""
+    nuclides = {source.nuclide: simulation.scenario.nuclides[source.nuclide] for source in sources}
+    return {
+        name: GammaConstant(gamma_constant(nuclide), gamma_constant(nuclide, "air_kerma"))
+        for name, nuclide in sorted(nuclides.items())
+    }

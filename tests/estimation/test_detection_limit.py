@@ -1,5 +1,7 @@
 """How strong a source would have had to be to be noticed."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,9 +74,21 @@ def test_most_places_reach_the_limit_that_is_told():
     assert np.isfinite(whole).all()
     assert one[CO_60] == pytest.approx(float(whole[CO_60]), rel=1e-4)
     assert np.isinf(np.delete(np.asarray(one), CO_60)).all()
-    # where nothing was measured, nothing would have been noticed
-    dark, _ = told(jnp.zeros_like(jnp.asarray(BACKGROUND)), ALL)
-    assert np.isfinite(dark).all() or np.isinf(dark).any()
+
+
+@pytest.mark.parametrize(("measured", "least", "most"), [(60, 1.0, 1.0), (30, 1.5, np.inf), (0, np.inf, np.inf)])
+def test_the_fewer_places_were_measured_the_higher_is_the_limit(measured, least, most):
+    @jax.jit
+    def told(valid):
+        m = replace(counted(FLIGHT, BACKGROUND), valid=valid)
+        problem = problem_of(KNOWN, m, SPANS)
+        state = settled(problem, no_sources(problem, 1, len(NUCLIDES)))
+        return noticed(problem, KNOWN.places, ALL, ASKED, state)
+
+    whole, part = (np.asarray(told(jnp.arange(60) < count)) for count in (60, measured))
+    assert np.isfinite(whole).all()
+    assert np.all(part >= 0.999 * least * whole)
+    assert np.all(part <= 1.001 * most * whole)
 
 
 def test_an_accelerator_tells_the_same_limits_of_many_missions(monkeypatch):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from swarmsim.results.extract import _hindrance
+from swarmsim.results.answer import _hindrance
 from swarmsim.results.finding import NO_SPECTRUM, NO_WAY
 from swarmsim.results.record import Event
 
