@@ -14,7 +14,7 @@ import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
 from swarmsim.config.sources import ACTIVITY_MAX_MBQ
-from swarmsim.device import some_at_a_time
+from swarmsim.device import for_those
 from swarmsim.estimation.detection_limit import NOTICED, noticed
 from swarmsim.estimation.forward import Problem, models_of, padded, trust_of
 from swarmsim.estimation.importance_sampling import Posterior
@@ -252,6 +252,7 @@ def localise(
     spans: tuple[Span, ...],
     params: LocalisationParams,
     known: State | None = None,
+    limits: jax.Array | bool = True,
 ) -> Estimated:
     """Find all sources that the counts tell of.
 
@@ -261,6 +262,7 @@ def localise(
         spans: rows from, to, and the detector model of each part (`spans_of`; static).
         params: settings.
         known: an earlier estimate's state, to go on from; zeros say nothing.
+        limits: [] whether detection limits are asked for; without, they are infinite.
     """
     problem = problem_of(presumed, measurements, spans)
     nuclides = jnp.asarray(presumed.nuclides)
@@ -274,7 +276,7 @@ def localise(
             unknowns=replace(state.unknowns, level=known.unknowns.level, lengths=known.unknowns.lengths),
         )
     state = find_sources(problem, presumed.places, nuclides, params.search, state)
-    return _report(presumed, problem, params, state)
+    return _report(presumed, problem, params, state, limits)
 
 
 def nothing_found(
@@ -340,7 +342,9 @@ def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
     return jnp.where(activity < 1e6 * ACTIVITY_MAX_MBQ, activity, jnp.inf)
 
 
-def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Estimated:
+def _report(
+    presumed: Presumed, problem: Problem, params: LocalisationParams, state: State, limits: jax.Array | bool
+) -> Estimated:  # fmt: skip
     site, s, m = presumed.site, state.sources, problem.measurements
     posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
     detection = ratios(problem, state)
@@ -387,8 +391,10 @@ def _report(presumed: Presumed, problem: Problem, params: LocalisationParams, st
         chi_squared=overall.chi_squared / overall.freedom,
         strain=strained - usual,
         windows=jnp.sum(m.valid),
-        noticed_bq=some_at_a_time(
-            lambda: noticed(problem, presumed.places, presumed.nuclides, least_of(params.search, state), state)
+        noticed_bq=for_those(
+            jnp.asarray(limits),
+            lambda: noticed(problem, presumed.places, presumed.nuclides, least_of(params.search, state), state),
+            lambda: jnp.full(jnp.shape(presumed.nuclides), jnp.inf),
         ),
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -122,7 +122,8 @@ class Inquiry:
 def learn(premises: Premises, inquiry: Inquiry) -> Inquiry:
     """The inquiry with the survey of all its counts, whose estimate goes on from the one before."""
     known = jax.tree.map(lambda x: jnp.where(inquiry.afresh, jnp.zeros_like(x), x), inquiry.survey.estimated.state)
-    return replace(inquiry, survey=survey(premises, inquiry.measurements, known))
+    # what begins afresh is gone on from: the detection limits are those of the last estimate
+    return replace(inquiry, survey=survey(premises, inquiry.measurements, known, ~inquiry.afresh))
 
 
 def nothing_learned(world: World, plan: Plan, windows: tuple[Windows | None, ...], key: jax.Array) -> Survey | None:
@@ -140,10 +141,13 @@ def nothing_learned(world: World, plan: Plan, windows: tuple[Windows | None, ...
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(nothing))
 
 
-def survey(premises: Premises, measurements: Measurements, known: State | None) -> Survey:
-    """Interpolate the map, find hotspots, and estimate the sources, from where an earlier estimate came to."""
+def survey(premises: Premises, measurements: Measurements, known: State | None, last: jax.Array) -> Survey:
+    """Interpolate the map, find hotspots, and estimate the sources, from where an earlier estimate came to.
+
+    What would have been noticed is told by the ``last`` [] estimate alone.
+    """
     chart, hotspots = _mapped(premises, measurements)
-    estimated = localise(premises.presumed, measurements, premises.spans, premises.localisation, known)
+    estimated = localise(premises.presumed, measurements, premises.spans, premises.localisation, known, last)
     return Survey(map=chart, hotspots=hotspots, estimated=estimated, found=estimated.fits.present[0])
 
 

@@ -122,6 +122,11 @@ def test_seeds_differ(records):
     assert np.mean(first[:count] != second[:count]) > 0.5
 
 
+def test_detection_limits_are_those_of_the_last_estimate(batch):
+    assert np.isinf(batch.conclusion.survey.estimated.noticed_bq).all()
+    assert np.isfinite(batch.conclusion.estimated.noticed_bq).all()
+
+
 def test_where_a_counter_was_saturated_no_errors_are_stated(simulation, batch, monkeypatch):
     monkeypatch.setattr("swarmsim.results.status.SATURATED_SHARE", 1e-6)
     record = swarmsim.mission_record(simulation, batch, 0)
