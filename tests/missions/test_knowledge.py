@@ -1,6 +1,7 @@
 """What a mission knows before it has measured anything."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -22,7 +23,8 @@ def test_what_is_known_before_has_the_shapes_of_what_a_survey_tells(values: list
     mission, _ = jax.eval_shape(lambda: begin_mission(key, world, plan))
 
     def told(windows: object) -> object:
-        return knowledge.survey(knowledge.premises_of(plan), knowledge.gathered(world, plan, windows, key), None)
+        measurements = knowledge.gathered(world, plan, windows, key)
+        return knowledge.survey(knowledge.premises_of(plan), measurements, None, jnp.asarray(True))
 
     found = jax.eval_shape(told, mission.windows)
     assert jax.tree.structure(found) == jax.tree.structure(mission.survey)
