@@ -205,7 +205,8 @@ def cases(name: str, seeds: int, photons: int) -> Iterator[tuple[list[Case], Flo
             case = drawn(rng, kind)
             number, pieces = ENERGIES_KEV.index(case.energy_kev), np.full((6, 2, 3), 1e3)
             pieces[: len(case.pieces)] = case.pieces
-            bodies = Boxes(*(jnp.asarray(pieces[:, k], jnp.float32) for k in (0, 1)), jnp.zeros(6, jnp.int32))
+            low, high = (jnp.asarray(pieces[:, k], jnp.float32) for k in (0, 1))
+            bodies = Boxes(low, high, jnp.zeros(6, jnp.int32))
             places = [jnp.asarray(x, jnp.float32) for x in (case.energy_kev, case.source_m, case.detectors_m)]
             found = seen(
                 jax.random.key(run), (tables(case.material, case.energy_kev),), bodies, *places, photons, COLLISIONS
@@ -215,8 +216,8 @@ def cases(name: str, seeds: int, photons: int) -> Iterator[tuple[list[Case], Flo
             mc = (np.asarray(x, float) for x in (found.uncollided, found.scattered, found.error))
             yield (
                 [
-                    Case(kind, case.material, case.energy_kev, case.block.wall_m, seed, run, *row[:3], float(row[3]))
-                    for row in zip(*mc, direct + scattered, strict=True)
+                    Case(kind, case.material, case.energy_kev, case.block.wall_m, seed, run, *row)
+                    for row in zip(*mc, np.asarray(direct + scattered, float), strict=True)
                 ],
                 lines_of(case),
                 way,
@@ -260,7 +261,8 @@ def rows_of(found: list[Case], lines: Floats, way: Crossed, detector: Detector) 
         assert way.shape is not None
         tables = (detector.attenuation_1_m, detector.scatter_1_m, detector.line_energy_kev)
         square = replace(way, length_m=way.shape.thin_m, shape=None)
-        slab = scattered_counts(*(x[number] for x in tables), detector.surrounds, square)
+        depth, share, energy_kev = (x[number] for x in tables)
+        slab = scattered_counts(depth, share, energy_kev, detector.surrounds, square)
         return slab.depth[0], slab.counts[0]
 
     depth, slab = (np.asarray(x, float) for x in jax.jit(jax.vmap(one))(number, way))

@@ -113,8 +113,8 @@ def deeper(rng: np.random.Generator, rows: Rows, n: int) -> Rows:
 def deviations(net: Network, rows: Rows) -> jax.Array:
     """ln of model over Monte Carlo [n], without the bound of deep walls: what it holds back would never be mended."""
     of = outputs(rows.features.T, net).T
-    lines = (x[:, None] for x in (rows.depth, rows.energy_kev, rows.growth))
-    ln_share, _, _ = log_share(of, *lines, jnp.asarray(UNBOUNDED), net.lines)
+    depth, energy_kev, growth = (jnp.asarray(x)[:, None] for x in (rows.depth, rows.energy_kev, rows.growth))
+    ln_share, _, _ = log_share(of, depth, energy_kev, growth, jnp.asarray(UNBOUNDED), net.lines)
     return jnp.log((rows.direct + rows.slab * jnp.exp(ln_share[:, 0]) + NOTHING) / rows.counts)
 
 

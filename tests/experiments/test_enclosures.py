@@ -115,7 +115,8 @@ def test_lengths_are_those_of_the_path(
     assert inside.sum(axis=1).max() <= 1, "boxes overlap"
     assert metres == pytest.approx(inside.any(axis=1).mean() * np.linalg.norm(b - a), abs=0.02)
     assert 0.0 <= place <= 1.0
-    bodies = Boxes(*(jnp.asarray(corners[:, k], jnp.float32) for k in (0, 1)), jnp.zeros(len(corners), jnp.int32))
+    low, high = (jnp.asarray(corners[:, k], jnp.float32) for k in (0, 1))
+    bodies = Boxes(low, high, jnp.zeros(len(corners), jnp.int32))
     on_device = lengths(bodies, jnp.asarray(a[None], jnp.float32), jnp.asarray(b, jnp.float32))
     assert float(on_device.sum()) == pytest.approx(metres, abs=1e-3 + 1e-3 * metres)
 

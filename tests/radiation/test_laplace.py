@@ -24,7 +24,7 @@ def test_evidence_of_a_flat_background_is_the_integral() -> None:
     strength[NATURAL] = 1.0
     start = np.zeros(COLUMNS, np.float32)
     start[[0, NATURAL]] = natural.sum(), 30.0
-    hypothesis = Hypothesis(*map(jnp.asarray, (column, scale, strength, start)), jnp.float32(1.0))
+    hypothesis = Hypothesis(*map(jnp.asarray, (column, scale, strength, start, np.float32(1.0))))
     data = Data(*map(jnp.asarray, (counts, np.ones(bins), natural.sum(), 120.0)))
     found = laplace(hypothesis, data)
     level = natural.sum() * (1.0 + NATURAL_STD * np.linspace(-2.0, 2.0, 401))

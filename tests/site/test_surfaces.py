@@ -13,8 +13,8 @@ HOUSE, WALL_M = (5.0, 4.0, 2.0), 0.2
 
 @jax.jit
 def _shares(start, end, half, wall):
-    columns = [[x[:, k] for k in range(3)] for x in (start, end, half)]
-    of_photons, around = scattered(Box(*columns, wall))
+    start, end, half = ([x[:, k] for k in range(3)] for x in (start, end, half))
+    of_photons, around = scattered(Box(start, end, half, wall))
     return jnp.exp(of_photons[::COEFFICIENTS]), around.closed, around.walls, around.thin_m
 
 

@@ -102,8 +102,8 @@ def test_no_building_scatters_out_of_all_proportion():
     half = np.exp(rng.uniform(np.log(0.2), np.log(20.0), (n, 3)))
     wall = np.where(rng.random(n) < 0.3, 0.0, np.exp(rng.uniform(np.log(0.001), np.log(0.4), n)))
     start, end = (rng.normal(size=(n, 3)) * np.exp(rng.uniform(-1.0, 4.0, (n, 1))) for _ in range(2))
-    columns = [list(jnp.asarray(x.T, jnp.float32)) for x in (start, end, half)]
-    found, around = scattered(Box(*columns, jnp.asarray(wall, jnp.float32)))
+    begins, ends, halves = (list(jnp.asarray(x.T, jnp.float32)) for x in (start, end, half))
+    found, around = scattered(Box(begins, ends, halves, jnp.asarray(wall, jnp.float32)))
     found = np.asarray(found)[:, np.asarray(around.thin_m) > 1e-4].reshape(len(DEPTHS), COEFFICIENTS, -1)
     assert len(DEPTHS) * COEFFICIENTS == OUTPUTS
     for level, growth in ((-2.0, 0.3), (0.0, 1.0), (0.7, 1.5)):
