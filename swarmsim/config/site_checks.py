@@ -149,10 +149,10 @@ def _check_map(scenario: Scenario, ground: Ground) -> Iterator[Problem]:
     mapping = scenario.mission.mapping
     if mapping is None or not scenario.detectors:
         return
-    from swarmsim.missions.plan_build import kept_mapping, mapped_area
+    from swarmsim.missions.plan_build import kept_mapping, mapped_areas
 
     try:
-        kept_mapping(mapping, mapped_area(scenario, ground.site.survey_area_m))
+        kept_mapping(mapping, mapped_areas(scenario, ground.site.survey_area_m))
     except InputError as error:
         for told in error.problems:
             details = {"given": told.given, "allowed": told.allowed, "suggestion": told.suggestion}

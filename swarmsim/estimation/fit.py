@@ -9,6 +9,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
+from swarmsim.config.sources import ACTIVITY_MAX_MBQ
 from swarmsim.estimation.forward import Problem, Rates, Ways, lengthened, rates, silent, variance_of
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.estimation.normal_equations import (
@@ -22,6 +23,7 @@ from swarmsim.estimation.normal_equations import (
     normal_equations,
     stepped,
 )
+from swarmsim.estimation.overload import likeliest, overloaded
 from swarmsim.pytree import pytree
 from swarmsim.site import sample
 
@@ -111,9 +113,10 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
     # where nothing is left of an activity its logarithm says nothing
     excess = (jnp.log(jnp.maximum(u.activity_bq, 1.0)) - problem.log_activity) / problem.log_activity_std
     value = likelihood + log_volume + at.log_volume - 0.5 * jnp.square(excess)
+    possible = u.activity_bq <= 1e6 * ACTIVITY_MAX_MBQ
     return Settled(
-        value=jnp.where(jnp.isfinite(value), value, -jnp.inf),
-        likelihood=jnp.where(jnp.isfinite(likelihood), likelihood, -jnp.inf),
+        value=jnp.where(possible & jnp.isfinite(value), value, -jnp.inf),
+        likelihood=jnp.where(possible & jnp.isfinite(likelihood), likelihood, -jnp.inf),
         unknowns=u,
         covariance=scaled_inverse(at.information),
         towards=at.towards,
@@ -169,7 +172,20 @@ def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u:
     gain = jnp.where(beyond_chance, jnp.clip(off * told / (1.0 + told), -FARTHEST_GAIN, FARTHEST_GAIN), 0.0)
     signal = (level * net + rest) * jnp.exp(gain)[:, None]
     of_rest = over(background * (m.rois - background - signal)) / of_background
-    return replace(u, activity_bq=level / unit, gain=gain, background=jnp.clip(of_rest, -1.0, 1.0))
+    begun = replace(u, activity_bq=level / unit, gain=gain, background=jnp.clip(of_rest, -1.0, 1.0))
+
+    def strong() -> Unknowns:
+        beside = known + jnp.sum(background, axis=1)
+        factor, _ = likeliest(problem, level * total, beside, variance)
+        own, same = jnp.zeros_like(gain), factor == 1.0
+        return replace(
+            begun,
+            activity_bq=factor * level / unit,
+            gain=jnp.where(same, begun.gain, own),
+            background=jnp.where(same, begun.background, own),
+        )
+
+    return jax.lax.cond(overloaded(problem), strong, lambda: begun)
 
 
 def alone(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, Linearised]:

@@ -4,6 +4,7 @@
 posterior of each (`swarmsim.estimation.posterior`).
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -23,7 +24,8 @@ from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.nodes import Span, nodes_of
 from swarmsim.estimation.pairs import strain
 from swarmsim.estimation.posterior import of_others, posteriors
-from swarmsim.estimation.seek import SearchParams, least_of
+from swarmsim.estimation.scan import true_counts
+from swarmsim.estimation.seek import SearchParams
 from swarmsim.estimation.sources import find_sources
 from swarmsim.estimation.starts import Places, places_of
 from swarmsim.estimation.state import Sources, State, no_sources, ratios
@@ -102,8 +104,10 @@ class Estimated:
     misfit: jax.Array  # [] standard deviations by which Pearson's chi-squared exceeds its degrees of freedom
     chi_squared: jax.Array  # [] over its degrees of freedom, about 1 for a model that describes the counts
     strain: jax.Array  # [] what windows' rates depart from the model by, beyond what is usual (`pairs.strain`)
+    highest_cps: jax.Array  # [D] true rate of the window with the most, by the model, of each detector model
     windows: jax.Array  # [] number of valid ones
-    noticed_bq: jax.Array  # [N] from which on a further source in the open would have been noticed; inf: never
+    noticed_bq: jax.Array  # [N] from which on a further source in free view would have been noticed; inf: never
+    strangers: jax.Array  # [] statistic of a further one of any nuclide not in question, over what is asked of one
     state: State  # to go on from when there are more counts
 
 
@@ -130,7 +134,7 @@ def presume(
     spec: Localisation,
     knowledge: Knowledge,
     ground_share: float,
-    corners_m: np.ndarray,
+    areas_m: Sequence[np.ndarray],
 ) -> Presumed:
     """What a mission with that ``knowledge`` presumes (host).
 
@@ -140,7 +144,7 @@ def presume(
         spec: of the estimate.
         knowledge: of the world.
         ground_share: of the nominal background, which comes from the ground.
-        corners_m: [V, 2] of the area in which sources are sought.
+        areas_m: in which sources are sought, convex polygons with corners [V, 2], counter-clockwise.
     """
     known, exact = _known_site(site, knowledge), knowledge.site == "exact"
     used = _materials_of(known)
@@ -176,7 +180,7 @@ def presume(
         sensitivity_std=on_host(knowledge.sensitivity_std),
         ground_share=on_host(ground_share),
         nuclides=on_host(chosen, bool),
-        places=places_of(known, corners_m, spec.grid_m, spec.presumed_height_m),
+        places=places_of(known, areas_m, spec.grid_m, spec.presumed_height_m),
         height_m=on_host(spec.presumed_height_m),
         height_std_m=on_host(spec.height_std_m),
         uncertain=uncertain,
@@ -308,8 +312,10 @@ def nothing_found(
         misfit=zero,
         chi_squared=zero,
         strain=zero,
+        highest_cps=jnp.zeros(len(presumed.detectors)),
         windows=jnp.int32(0),
         noticed_bq=jnp.zeros(np.shape(presumed.nuclides)),
+        strangers=zero,
         state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
     )
 
@@ -379,6 +385,12 @@ def _report(
         beside_bq=noticed_from(told, params.search.further),
     )
     strained, usual = strain(problem, state)
+    rate = jnp.sum(true_counts(problem, state.added, state.unknowns), axis=1) / jnp.maximum(m.exposure_s, 1e-9)
+    limits_bq, strangers = for_those(
+        jnp.asarray(limits),
+        lambda: noticed(problem, presumed.places, presumed.nuclides, params.search, state),
+        lambda: (jnp.full(jnp.shape(presumed.nuclides), jnp.inf), jnp.zeros(())),
+    )
     order = jnp.argsort(jnp.where(s.present, -detection, jnp.inf))
 
     def ordered(x: Any) -> Any:
@@ -390,11 +402,9 @@ def _report(
         misfit=(overall.chi_squared - overall.freedom) / overall.spread,
         chi_squared=overall.chi_squared / overall.freedom,
         strain=strained - usual,
+        highest_cps=jnp.max(jnp.where(m.valid, rate, 0.0)[:, None] * problem.detector, axis=0),
         windows=jnp.sum(m.valid),
-        noticed_bq=for_those(
-            jnp.asarray(limits),
-            lambda: noticed(problem, presumed.places, presumed.nuclides, least_of(params.search, state), state),
-            lambda: jnp.full(jnp.shape(presumed.nuclides), jnp.inf),
-        ),
+        noticed_bq=limits_bq,
+        strangers=strangers,
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.device import each
-from swarmsim.estimation.forward import Problem, padded, silent
+from swarmsim.estimation.forward import Problem, padded, silent, with_one_ray
+from swarmsim.estimation.nodes import inverse_square_gain
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations, of_window
 from swarmsim.pytree import on_device, pytree
 from swarmsim.radiation.detector import AIR, Detector, Source
@@ -125,6 +126,22 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     )
 
 
+def open_totals(problem: Problem, points_m: jax.Array, nuclide: jax.Array) -> jax.Array:
+    """Counts [C, n] before dead time that sources of 1 Bq of ``nuclide`` [C] at ``points_m`` [C, 3] add in the open.
+
+    By the distance alone, as the `scan` has them.
+    """
+    m, count = problem.measurements, points_m.shape[0]
+    air = [_air_of(d) for d in problem.detectors]
+    sums = [
+        jnp.sum(open_rates(d, len(d.nuclide_names), k), axis=2) for d, k in zip(problem.detectors, air, strict=True)
+    ]
+    of_detector = jnp.stack(sums)[:, nuclide]  # [D, C, J]
+    phi = _weights(points_m, m.position_m, m.valid)
+    parts = (of_detector[d].T[:, :, None] * problem.detector[:, d] for d in range(len(sums)))  # each [J, C, n]
+    return m.exposure_s * sum((jnp.sum(phi * part, axis=0) for part in parts), jnp.zeros((count, m.valid.shape[0])))
+
+
 def _air_of(detector: Detector) -> int:
     """Number of air among the materials of a detector."""
     return detector.material_names.index(AIR) if AIR in detector.material_names else 0
@@ -133,16 +150,19 @@ def _air_of(detector: Detector) -> int:
 def open_counts(problem: Problem, point_m: jax.Array, nuclide: jax.Array) -> jax.Array:
     """Counts [n, R] before dead time that a source of 1 Bq at ``point_m`` [3] adds where no wall is in the way."""
     source = Source(position_m=point_m, activity_bq=jnp.ones(()), nuclide=nuclide)
-    position, parts = problem.measurements.position_m, []
-    heights = jax.vmap(partial(above_ground, problem.site, point_m))(position)
-    ground = jax.vmap(partial(mirrored, point_m))(position, *heights)
-    distance = jnp.linalg.norm(position - point_m, axis=1)
+    nodes, parts = with_one_ray(problem).nodes, []
+    offset = nodes.position_m - point_m
+    heights = jax.vmap(partial(above_ground, problem.site, point_m))(nodes.position_m)
+    ground = jax.vmap(partial(mirrored, point_m))(nodes.position_m, *heights)
+    distance, gain = jnp.linalg.norm(offset, axis=1), inverse_square_gain(offset, nodes)
     for first, last, number, _ in problem.spans:
         own, detector = slice(first, last), problem.detectors[number]
         length = jnp.zeros((last - first, len(detector.material_names)))
         length = length.at[:, _air_of(detector)].set(distance[own])
         way = Crossed(length_m=length, place=jnp.full_like(length, 0.5), shape=wide(length, ground[own]))
-        rates = roi_rates_and_slopes(detector, source, way, position[own], problem.measurements.axis[own]).rates
+        rates = roi_rates_and_slopes(
+            detector, source, way, nodes.position_m[own], nodes.axis[own], weight=gain[own]
+        ).rates  # fmt: skip
         parts.append(padded(rates, problem.background.shape[1]))
     return jnp.concatenate(parts) * problem.measurements.exposure_s[:, None]
 

@@ -15,6 +15,7 @@ from swarmsim.estimation.fit import FLAT, Settled
 from swarmsim.estimation.forward import Problem, Rates, variance_of
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.normal_equations import Others
+from swarmsim.estimation.overload import prominent
 from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
 from swarmsim.estimation.starts import STARTS, Places, Starts, no_starts, starts_of
 from swarmsim.estimation.state import State, shared, without
@@ -72,6 +73,8 @@ def sought(
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
         # what is sought again stays where it is rather than at a place that explains much less
         found = ratio > jnp.where(adding, least_of(params, state), -HOPELESS * params.further)
+        fit = best.fit
+        found &= ~adding | prominent(problem, fit.unknowns.activity_bq * fit.rates.counts, others)
         after = with_source(problem, state, slot, best)
         table = after.sources.nuclide_value.at[slot].set(values)
         after = replace(after, sources=replace(after.sources, nuclide_value=table))

@@ -5,15 +5,21 @@ Walls of a building hide a source from one side and let it through on another, s
 hollow boxes are looked at besides, with rays.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from swarmsim.device import for_those
 from swarmsim.estimation.forward import Problem
 from swarmsim.estimation.normal_equations import Others, Unknowns
-from swarmsim.estimation.scan import scan, strongest
+from swarmsim.estimation.overload import likeliest_source, overloaded
+from swarmsim.estimation.scan import open_totals, scan, strongest
 from swarmsim.pytree import on_host, pytree
 from swarmsim.site import Site
+from swarmsim.site.areas import within
 from swarmsim.site.model import height_at
 from swarmsim.site.rooms import rooms_of
 
@@ -28,10 +34,11 @@ FROM_WALLS_M = 0.3  # of places in buildings
 class Places:
     """Where sources are looked for first, by the area and the site."""
 
-    points_m: jax.Array  # [C, 3] grid over the area, world
+    points_m: jax.Array  # [C, 3] grid over the area's bounding box, world
     inside_m: jax.Array  # [I, 2] in hollow boxes, world
     near: jax.Array  # [I] int32 the nearest point of the grid
     there: jax.Array  # [I] bool, whether it is a place: the rest fills the array up
+    surveyed: jax.Array  # [C] bool, whether the point lies in the area
 
 
 @pytree
@@ -45,12 +52,13 @@ class Starts:
     there: jax.Array  # [I] bool
 
 
-def places_of(site: Site, corners_m: np.ndarray, step_m: float, height_m: float) -> Places:
-    """The places ``height_m`` above the ground of an area with those corners [V, 2] (host).
+def places_of(site: Site, areas_m: Sequence[np.ndarray], step_m: float, height_m: float) -> Places:
+    """The places ``height_m`` above the ground around areas, convex polygons with corners [V, 2] (host).
 
     Points of the grid lie ``step_m`` apart, farther where there would be too many, and so do those in a building.
     """
-    low, high = np.min(corners_m, axis=0), np.max(corners_m, axis=0)
+    corners = np.concatenate(areas_m)
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
     step = max(step_m, float(np.sqrt(np.prod(high - low) / POINTS_MAX)))
     axes = [np.linspace(a, b, max(2, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True)]
     xy = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
@@ -67,6 +75,7 @@ def places_of(site: Site, corners_m: np.ndarray, step_m: float, height_m: float)
         inside_m=on_host(inside),
         near=on_host(near, np.int32),
         there=on_host(there, bool),
+        surveyed=on_host(within(areas_m, xy), bool),
     )
 
 
@@ -104,6 +113,16 @@ def starts_of(
     """
     places = jax.tree.map(jnp.asarray, places)
     scanned = scan(problem, places.points_m, allowed, others, u)
+    alone = ~jnp.any(others.counts > 0.0)
+
+    def strong() -> jax.Array:
+        # the fit has raised the background to what it is that overloads the counters
+        background = jnp.sum(problem.background, axis=1)
+        return likeliest_source(problem, open_totals(problem, places.points_m, scanned.nuclide), background)
+
+    # the score is that of a weak source: around one that paralyses counters it is largest far from it
+    value = for_those(alone & overloaded(problem), strong, lambda: scanned.statistic)
+    scanned = replace(scanned, statistic=value)
     index, statistic = strongest(scanned, places.points_m, STARTS, APART_M)
     near = places.near
     order = jnp.argsort(jnp.where(places.there, -scanned.statistic[near], jnp.inf))

@@ -55,12 +55,12 @@ def build_plan(scenario: Scenario, site_model: SiteModel, world: World) -> Plan:
     kept_windows = tuple(_kept_windows(group) for group in world.groups)
     params = localisation_params(localisation) if localisation is not None and detectors else None
     mapping = presumed = None
-    corners = mapped_area(scenario, site_model.site.survey_area_m)
+    areas = mapped_areas(scenario, site_model.site.survey_area_m)
     if localisation is not None and detectors:
         ground_share = mission.background.ground_share
-        presumed = presume(site_model.site, detectors, localisation, mission.knowledge, ground_share, corners)
+        presumed = presume(site_model.site, detectors, localisation, mission.knowledge, ground_share, areas)
     if mission.mapping is not None and detectors:
-        mapping = kept_mapping(mission.mapping, corners)
+        mapping = kept_mapping(mission.mapping, areas)
     return Plan(
         site=site_model.site,
         detectors=detectors,
@@ -89,9 +89,9 @@ def _trail(scenario: Scenario, world: World) -> int:
     return 2 + sum(math.ceil(phase.time_limit_s / world.timing.decision_period_s) + 1 for phase in phases)
 
 
-def kept_mapping(mapping: Mapping, corners: np.ndarray) -> MappingParams:
-    """The map's grid and basis functions over ``corners`` [V, 2]; raises `InputError` as `mapping_params` does."""
-    return _kept_mapping(mapping, tuple(map(tuple, corners.tolist())))
+def kept_mapping(mapping: Mapping, areas: list[np.ndarray]) -> MappingParams:
+    """The map's grid and basis functions over ``areas`` [V, 2]; raises `InputError` as `mapping_params` does."""
+    return _kept_mapping(mapping, tuple(map(tuple, np.concatenate(areas).tolist())))
 
 
 @kept(4)
@@ -100,14 +100,12 @@ def _kept_mapping(mapping: Mapping, corners: tuple[tuple[float, ...], ...]) -> M
     return mapping_params(mapping, np.array(corners))
 
 
-def mapped_area(scenario: Scenario, survey_area_m: ArrayLike) -> np.ndarray:
-    """Corners [V, 2] of what the map covers: the areas that phases survey, or the site's survey area [U, 2]."""
+def mapped_areas(scenario: Scenario, survey_area_m: ArrayLike) -> list[np.ndarray]:
+    """What the map covers, corners [V, 2] of each: the areas that phases survey, or the site's survey area [U, 2]."""
     surveys = [s for s in scenario.settings if isinstance(s, ParallelLines)]
     areas = [np.array(s.area_m) for s in surveys if s.area_m is not None]
     whole = any(s.area_m is None for s in surveys)
-    if areas and not whole:
-        return np.concatenate(areas)
-    return np.concatenate([np.asarray(survey_area_m), *areas])
+    return areas if areas and not whole else [np.asarray(survey_area_m), *areas]
 
 
 def _windows(scenario: Scenario, world: World) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -10,6 +10,7 @@ share g that the ground adds (`swarmsim.radiation.ground`).
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import brentq
 
 from swarmsim.radiation.cylinder import NEAR_TABLES, direction_basis, near_ratio
 from swarmsim.radiation.detector import Detector, Source
@@ -192,6 +193,24 @@ def saturating_rate(paralyzable_s: float, non_paralyzable_s: float) -> float:
     # the derivative of log m vanishes where n t_p (1 + n t_n) = 1
     a, b = paralyzable_s * non_paralyzable_s, paralyzable_s
     return float(1.0 / b if a == 0.0 else (-b + np.sqrt(b * b + 4.0 * a)) / (2.0 * a))
+
+
+def rate_showing(detector: Detector, share: float) -> float:
+    """Lowest true rate at which a detector shows ``share`` (0..1) of its `highest_rate`; inf without dead time (host).
+
+    Beyond it a change of the rate hardly shows.
+    """
+    paralyzable, non_paralyzable = float(detector.paralyzable_s), float(detector.non_paralyzable_s)
+    if paralyzable <= 0.0 and non_paralyzable <= 0.0:
+        return np.inf
+    wanted = share * highest_rate(detector)
+    if paralyzable <= 0.0:
+        return wanted / (1.0 - wanted * non_paralyzable)
+
+    def beyond(rate: float) -> float:
+        return rate * np.exp(-rate * paralyzable) / (1.0 + rate * non_paralyzable) - wanted
+
+    return float(brentq(beyond, 0.0, saturating_rate(paralyzable, non_paralyzable)))
 
 
 def exposure_of(detector: Detector, period_s: jax.Array | float) -> jax.Array:

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from swarmsim.estimation import Estimated
+from swarmsim.missions.plan_build import mapped_areas
 from swarmsim.missions.state import MissionState
 from swarmsim.radiation.identify import NONE, UNKNOWN
-from swarmsim.radiation.rate import highest_rate
+from swarmsim.radiation.rate import highest_rate, rate_showing
 from swarmsim.results.finding import NO_SPECTRUM, NO_WAY, finding
 from swarmsim.results.record import Estimate, Event, RadiationMap, Samples, Spectrum
 from swarmsim.results.sources import gamma_constants
-from swarmsim.results.status import Fit, Verdict, assess, source_of_spectrum
+from swarmsim.results.status import SATURATED_SHARE, Fit, Verdict, assess, source_of_spectrum
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.site.model import height_at
 from swarmsim.world.build import detector_models
@@ -53,9 +54,10 @@ def answer_of(
     examined = _examined(simulation, spectrum, surveyed, final)
     telling = None if examined is None else spectrum
     chart = _map(simulation, conclusion.survey)
-    verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, telling, examined or 0, end)
+    verdict = _verdict(simulation, samples, chart, conclusion, surveyed, final, telling, examined or 0, end, noticed)
     if verdict.status == "saturated":
         surveyed, final = (tuple(replace(one, errors_known=False) for one in several) for several in (surveyed, final))
+        noticed = {}  # a paralysed counter notices nothing
     said = finding(verdict, final, telling, hindrance, one_nuclide, examined or 0, noticed)
     return Answer(said, verdict, surveyed, final, chart, spectrum, noticed)
 
@@ -172,6 +174,7 @@ def _verdict(
     spectrum: Spectrum | None,
     examined: int,
     end: MissionState,
+    noticed: dict[str, float],
 ) -> Verdict:
     """Status of the mission's answer."""
     estimated, detectors, presumed = conclusion.estimated, simulation.plan.detectors, simulation.plan.presumed
@@ -186,10 +189,16 @@ def _verdict(
     suggested = ""
     if spectrum is not None and spectrum.nuclide != UNNAMED[NONE] and not _no_way(simulation, end):
         suggested = spectrum.nuclide if spectrum.confidence >= float(simulation.plan.confidence_min) else ""
+    doubtful = np.array([rate_showing(detector, SATURATED_SHARE) for detector in detectors])
     fit = Fit(
-        misfit=float(estimated.misfit), chi_squared=float(estimated.chi_squared), strain=float(estimated.strain)
-    )  # fmt: skip
-    ground = height_at(simulation.site_model.site, np.asarray(samples.position_m, float)[:, :2])
+        misfit=float(estimated.misfit),
+        chi_squared=float(estimated.chi_squared),
+        strain=float(estimated.strain),
+        strangers=float(estimated.strangers),
+        load=float(np.max(np.asarray(estimated.highest_cps) / doubtful, initial=0.0)),
+    )
+    site = simulation.site_model.site
+    ground = height_at(site, np.asarray(samples.position_m, float)[:, :2])
     return assess(
         samples,
         chart,
@@ -204,6 +213,8 @@ def _verdict(
         {} if spectrum is None else spectrum.scores,
         suggested,
         examined,
+        noticed,
+        mapped_areas(simulation.scenario, site.survey_area_m),
     )
 
 

@@ -54,9 +54,9 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
         row |= {f"true_thickness_factor_{key}": value for key, value in record.departures.thickness_factor.items()}
         row |= {f"true_sensitivity_factor_{key}": value for key, value in record.departures.sensitivity_factor.items()}
     row["sources_found"] = len(record.estimates)
-    limits = [value for value in record.noticed_mbq.values() if np.isfinite(value)]
-    # of the nuclide in question that is noticed first, and of the one that is last
-    row |= {"noticed_least_mbq": min(limits, default=None), "noticed_most_mbq": max(limits, default=None)}
+    # of the nuclide in question that is noticed first, and of the one that is last; None where it never is
+    limits = [value if np.isfinite(value) else None for value in sorted(record.noticed_mbq.values())]
+    row |= {"noticed_least_mbq": next(iter(limits), None), "noticed_most_mbq": next(reversed(limits), None)}
     row["nuclide"] = named(record.spectrum)
     row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
     dose = dose_summary(record)

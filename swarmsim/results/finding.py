@@ -65,12 +65,12 @@ def _noticed(noticed_mbq: Mapping[str, float]) -> str:
         return ""
     limits = sorted((value, name) for name, value in noticed_mbq.items() if math.isfinite(value))
     if not limits:
-        return f" (nor would one of any activity have been noticed in the open, over {MOST:.0%} of the survey area)"
+        return f" (nor would one of any activity in free view have been noticed, over {MOST:.0%} of the survey area)"
     told = [f"{in_mbq(value)} {name}" for value, name in (limits[0], limits[-1])]
     from_ = told[0] if len(limits) == 1 else f"{told[0]} to {told[1]}"
     never = sorted(set(noticed_mbq) - {name for _, name in limits})
     but = f", but none of {' or '.join(never[:3])}{' and others' if len(never) > 3 else ''}" if never else ""
-    return f" (in the open, over {MOST:.0%} of the survey area, one would have been noticed from {from_} on{but})"
+    return f" (in free view, over {MOST:.0%} of the survey area, one would have been noticed from {from_} on{but})"
 
 
 def _placed(estimate: Estimate) -> str:
@@ -96,7 +96,8 @@ def _activity(estimate: Estimate) -> str:
     if not (math.isfinite(std) and std > 0.0):
         return in_mbq(value)
     digits = max(0, 1 - math.floor(math.log10(std)))
-    return f"{value:.{digits}f} ± {std:.{digits}f} MBq"
+    told = f"{value:.{digits}f}"
+    return f"{told if float(told) > 0.0 else f'{value:.2g}'} ± {std:.{digits}f} MBq"
 
 
 def _examined(estimate: Estimate, spectrum: Spectrum | None, hindrance: str | None, by: str) -> str:

@@ -227,7 +227,7 @@ class MissionRecord:
     survey_further: tuple[Estimate, ...] = ()  # further sources by the survey's counts
     further: tuple[Estimate, ...] = ()  # further sources by all counts
     noticed_mbq: Mapping[str, float] = field(default_factory=dict)
-    """Activity by nuclide in question from which on a source in the open, beside those found, would have been noticed
+    """Activity by nuclide in question from which on a source in free view, beside those found, would have been noticed
     with 95 %, at 95 % of the survey area (a detection limit, ISO 11929); infinite where none would.
     """
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
 from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
+from swarmsim.site.areas import within
 
 Floats = NDArray[np.floating]
 Status = Literal[
@@ -44,6 +45,7 @@ CONFIRMED = 0.9  # probability in the spectrum taken near it, above which a nucl
 IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
+STRANGERS = "the counts show a source of a nuclide that is not in question (knowledge.nuclides)"
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
 UNEXPLAINED_SIGMA = 3.0  # of the background: a hotspot that exceeds it by less may be of the background
 
@@ -55,6 +57,8 @@ class Fit:
     misfit: float  # standard deviations by which chi-squared exceeds its degrees of freedom
     chi_squared: float  # over its degrees of freedom
     strain: float = 0.0  # what rates depart from the model by, beyond what is usual (`Estimated.strain`)
+    strangers: float = 0.0  # `Estimated.strangers`
+    load: float = 0.0  # highest true rate of a counter by them, over that at which it shows `SATURATED_SHARE`
 
 
 @dataclass(frozen=True)
@@ -80,12 +84,14 @@ def assess(
     identified: Mapping[str, float] = MappingProxyType({}),
     suggested: str = "",
     spectrum_of: int = 0,
+    noticed_mbq: Mapping[str, float] = MappingProxyType({}),
+    areas_m: Sequence[Floats] = (),
 ) -> Verdict:
     """Judge an answer.
 
     Args:
         samples: all measurements.
-        chart: the radiation map, whose cells are the survey area.
+        chart: the radiation map.
         limits_cps: for each sample [n] the highest rate that its counter can show (inf: any), and its background.
         ground_m: height of the ground below each sample [n].
         fit: of all sources to all counts.
@@ -97,32 +103,47 @@ def assess(
         identified: probability of each nuclide in the spectrum.
         suggested: the nuclide that the spectrum is of, or "unknown"; empty where none was taken or it shows none.
         spectrum_of: number of the source near which it was taken (`source_of_spectrum`).
+        noticed_mbq: activities from which on nuclides would have been noticed (`MissionRecord.noticed_mbq`).
+        areas_m: that were to be surveyed, convex polygons with corners [V, 2]; by default all that is mapped.
     """
-    covered = coverage(samples, chart, ground_m)
+    covered = coverage(samples, chart, ground_m, areas_m)
     reasons = []
     status: Status = "located" if final else "none"
-    if _saturated(samples, limits_cps):
+    if fit.load > 1.0 or _saturated(samples, limits_cps):
         status = "saturated"
         reasons.append("a counter was driven into its dead time, so rates and places close to the source are doubtful")
     if covered < COVERED_SHARE:
         status = "incomplete_survey" if status in ("none", "located") else status
         reasons.append(f"only {covered:.0%} of the survey area was measured")
+    if not final and min(noticed_mbq.values(), default=0.0) > activity[0]:
+        status = "incomplete_survey" if status == "none" else status
+        reasons.append(f"one as presumed, of {in_mbq(activity[0])} (knowledge.activity_mbq), would have gone unnoticed")
     strength = [one.activity_mbq * at_1_m[one.nuclide].kerma_ugy_h if at_1_m else one.activity_mbq for one in final]
     doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity)
     examined = final[spectrum_of] if final else None
     doubts += _mixed(final, examined, identified) + _contradicted(examined, suggested)
+    doubts += _unnamed(final, examined, suggested)
+    if not final and fit.strangers > 1.0:
+        doubts.append(("inconsistent", STRANGERS))
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
+    if status == "saturated":  # no errors of places are stated
+        doubts = [doubt for doubt in doubts if doubt[0] != "detected"]
     reasons += [sentence for _, sentence in doubts]
     return Verdict(status, tuple(reasons), covered)
 
 
-def coverage(samples: Samples, chart: RadiationMap, ground_m: Floats) -> float:
-    """Share of the map's cells with a measurement near them: within the measurement's height above ground."""
+def coverage(samples: Samples, chart: RadiationMap, ground_m: Floats, areas_m: Sequence[Floats] = ()) -> float:
+    """Share of the map's cells with a measurement near them: within the measurement's height above ground.
+
+    Of the cells in ``areas_m`` where there are any.
+    """
     ny, nx = chart.mean_cps.shape
     x = chart.origin_m[0] + chart.cell_m * np.arange(nx)
     y = chart.origin_m[1] + chart.cell_m * np.arange(ny)
     cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    inside = within(areas_m, cells)
+    cells = cells[inside] if np.any(inside) else cells
     place = np.asarray(samples.position_m, float)
     if not len(place):
         return 0.0
@@ -249,6 +270,21 @@ def _contradicted(examined: Estimate | None, suggested: str) -> list[tuple[Statu
         return []
     other = "none in the library" if suggested == "unknown" else suggested
     return [("ambiguous", f"the spectrum taken near the {examined.nuclide} source is of {other}")]
+
+
+def _unnamed(final: Sequence[Estimate], examined: Estimate | None, suggested: str) -> list[tuple[Status, str]]:
+    """Sources whose nuclide neither the counts nor a spectrum is sure of: the place follows from the nuclide.
+
+    What lies above a source may be other than presumed: of twelve that were buried six were told as of another nuclide.
+    """
+    return [
+        (
+            "ambiguous",
+            f"the {one.nuclide} source may be of another nuclide ({one.nuclide_confidence:.0%} by the counts)",
+        )
+        for one in final
+        if one.nuclide_confidence < CONFIRMED and not (one is examined and suggested == one.nuclide)
+    ]
 
 
 def _implausible(final: Sequence[Estimate], presumed_mbq: float, std: float) -> list[tuple[Status, str]]:

@@ -70,7 +70,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
 
     Errors are distances to the nearest true source: of the hotspot on the map (horizontal), of the source in space. A
     line or an area counts by its centre of activity, a source on a vehicle by where it was at the start; activities are
-    those of the start. ``noticed_mbq`` is the activity by nuclide from which on a source in the open, beside those
+    those of the start. ``noticed_mbq`` is the activity by nuclide from which on a source in free view, beside those
     found, would have been noticed (`MissionRecord.noticed_mbq`; None: none would). ``departures`` is what was drawn for
     the mission within its knowledge (`departures_summary`).
     """

@@ -181,7 +181,7 @@ def presumed(site, detectors, half=HALF, knowledge=None, **changes):
     """What a mission presumes that knows the site and may meet a background that varies."""
     corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     return presume(
-        site, detectors, spec(**changes), knowledge or Knowledge(site="exact", learning_rate=1.0), 0.0, corners
+        site, detectors, spec(**changes), knowledge or Knowledge(site="exact", learning_rate=1.0), 0.0, [corners]
     )
 
 

@@ -107,6 +107,23 @@ def test_no_source_is_found_in_a_background_with_a_step(localiser, seed):
     assert 0.95 < float(estimated.background_scale) < 1.25
 
 
+@pytest.mark.parametrize("activity", [1e11, 1e12, 1e13])
+def test_a_source_that_overloads_the_counter_is_one_source(localiser, activity):
+    """The strongest paralyses it near the source: it counts less there than far off."""
+    rng = np.random.default_rng(int(np.log10(activity)))
+    for seed in range(3):
+        position = np.append(rng.uniform(-45.0, 45.0, 2), 1.0)
+        mean = mean_rois(SITE, DETECTORS, AERIAL, [(position, activity, "Co-60")])
+        estimated = localiser(drawn(AERIAL, mean, seed))
+        fits = estimated.fits
+        assert fits.present.tolist() == [True, False]
+        assert names(estimated)[0] == "Co-60"
+        assert np.linalg.norm(np.asarray(fits.position_m[0])[:2] - position[:2]) < 0.5
+        assert float(fits.activity_bq[0]) == pytest.approx(activity, rel=0.05)
+        true = np.asarray(estimated.highest_cps)[0]
+        assert true * float(DETECTORS[0].paralyzable_s) == pytest.approx(1.4 * activity / 1e12, rel=0.3)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_two_sources_of_different_nuclides_are_both_found(localiser, seed):
     turn = 1.0 + 2.0 * seed

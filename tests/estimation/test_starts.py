@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmsim.estimation.starts import ROOMS, places_of
+from swarmsim.site.areas import within
 from tests.estimation.survey import place
 
 CORNERS = 70.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -27,7 +28,7 @@ def site_of(boxes, wall=0.3, axis=(1.0, 0.0)):
 )  # fmt: skip
 def test_every_spot_of_a_building_is_near_a_place_in_it(x, y, length, width, yaw):
     axis = np.array([np.cos(yaw), np.sin(yaw)])
-    places = places_of(site_of([((x, y), (length, width))], axis=axis), CORNERS, 4.0, 1.0)
+    places = places_of(site_of([((x, y), (length, width))], axis=axis), [CORNERS], 4.0, 1.0)
     there = places.there
     offset = places.inside_m[there] - np.array([x, y])
     own = np.stack([offset @ axis, offset @ np.array([-axis[1], axis[0]])], axis=1)
@@ -40,13 +41,13 @@ def test_every_spot_of_a_building_is_near_a_place_in_it(x, y, length, width, yaw
 
 
 def test_the_nearest_point_of_the_grid_is_known():
-    places = places_of(site_of([((10.0, -20.0), (8.0, 5.0))]), CORNERS, 4.0, 1.0)
+    places = places_of(site_of([((10.0, -20.0), (8.0, 5.0))]), [CORNERS], 4.0, 1.0)
     apart = np.linalg.norm(places.points_m[places.near[places.there], :2] - places.inside_m[places.there], axis=1)
     assert np.all(apart < 2.0 * np.sqrt(2.0) + 0.1)
 
 
 def test_a_site_without_buildings_has_no_places_in_them():
-    places = places_of(place(), CORNERS, 4.0, 1.0)
+    places = places_of(place(), [CORNERS], 4.0, 1.0)
     assert places.there.shape == (ROOMS,)
     assert not places.there.any()
     assert np.isfinite(places.inside_m).all()
@@ -55,7 +56,7 @@ def test_a_site_without_buildings_has_no_places_in_them():
 def test_a_town_has_one_place_in_each_building_at_least():
     side = np.arange(-65.0, 66.0, 5.0)
     town = [((x, y), (2.2, 2.2)) for x in side for y in side]
-    places = places_of(site_of(town), CORNERS, 1.0, 1.0)
+    places = places_of(site_of(town), [CORNERS], 1.0, 1.0)
     assert len(town) <= places.there.sum() <= ROOMS
     inside = places.inside_m[places.there]
     apart = np.linalg.norm(np.array([at for at, _ in town])[:, None] - inside, axis=2).min(axis=1)
@@ -64,7 +65,7 @@ def test_a_town_has_one_place_in_each_building_at_least():
 
 def test_where_there_are_too_many_buildings_those_with_a_place_lie_all_over_the_area():
     side = np.arange(-69.0, 70.0, 3.0)
-    places = places_of(site_of([((x, y), (1.2, 1.2)) for x in side for y in side]), CORNERS, 1.0, 1.0)
+    places = places_of(site_of([((x, y), (1.2, 1.2)) for x in side for y in side]), [CORNERS], 1.0, 1.0)
     assert places.there.all()
     assert np.all(np.ptp(places.inside_m, axis=0) > 130.0)
 
@@ -72,11 +73,36 @@ def test_where_there_are_too_many_buildings_those_with_a_place_lie_all_over_the_
 def test_buildings_outside_the_area_take_no_place_from_those_inside():
     hall = ((0.0, 0.0), (20.0, 15.0))
     far = [((x, y), (3.0, 3.0)) for x in range(200, 600, 10) for y in range(-150, 150, 10)]
-    alone, among = (places_of(site_of(boxes), CORNERS, 4.0, 1.0) for boxes in ([hall], [*far, hall]))
+    alone, among = (places_of(site_of(boxes), [CORNERS], 4.0, 1.0) for boxes in ([hall], [*far, hall]))
     np.testing.assert_allclose(among.inside_m, alone.inside_m, atol=1e-4)
     assert among.there.sum() == 80
 
 
 @pytest.mark.parametrize("x", [120.0, -120.0])
 def test_a_building_outside_the_area_is_left_out(x):
-    assert not places_of(site_of([((x, 0.0), (8.0, 5.0))]), CORNERS, 4.0, 1.0).there.any()
+    assert not places_of(site_of([((x, 0.0), (8.0, 5.0))]), [CORNERS], 4.0, 1.0).there.any()
+
+
+@given(
+    corners=st.lists(st.tuples(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0)), min_size=3, max_size=3),
+    places=st.lists(st.tuples(st.floats(-60.0, 60.0), st.floats(-60.0, 60.0)), min_size=1, max_size=20),
+)
+def test_a_place_in_a_triangle_is_a_mixture_of_its_corners(corners, places):
+    a, b, c = np.array(corners)
+    twice = (b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]
+    if abs(twice) < 10.0:
+        return
+    triangle = np.array([a, b, c] if twice > 0.0 else [a, c, b])
+    shares = np.linalg.solve(np.vstack([triangle.T, np.ones(3)]), np.vstack([np.array(places).T, np.ones(len(places))]))
+    clear = np.abs(shares).min(axis=0) > 1e-3
+    assert np.all((within([triangle], places) == (shares > 0.0).all(axis=0))[clear])
+    elsewhere = triangle + 1e3
+    assert np.array_equal(within([elsewhere, triangle], places), within([triangle], places))
+    assert within([triangle], triangle).all()
+
+
+def test_points_outside_of_the_areas_are_not_surveyed():
+    places = places_of(place(), [CORNERS[:3] * [0.5, 1.0]], 4.0, 1.0)
+    share = places.surveyed.mean()
+    assert share == pytest.approx(0.5, abs=0.05)
+    assert places_of(place(), [CORNERS], 4.0, 1.0).surveyed.all()

@@ -142,7 +142,7 @@ def test_no_activity_is_a_clear_finding(simulation):
     silent = swarmsim.build(swarmsim.load("recon", (*RECON, "sources.0.activity_mbq=0")))
     assert jax.tree.structure(silent.world) == jax.tree.structure(world)
     record = swarmsim.mission_record(silent, silent.rollout(1), 0)
-    assert record.finding.startswith("no source above background (in the open, over 95% of the survey area, one would")
+    assert record.finding.startswith("no source above background (in free view, over 95% of the survey area, one would")
     # of those of 40 MBq in the open nine of ten are found: those at the weakest places are not
     assert 25.0 < record.noticed_mbq["Co-60"] < 55.0
     assert record.noticed_mbq["Pu-239"] > 100.0 * record.noticed_mbq["Co-60"]

@@ -21,6 +21,7 @@ from swarmsim.radiation import (
     restrict,
 )
 from swarmsim.radiation.attenuation import linear_attenuation
+from swarmsim.radiation.rate import highest_rate, rate_showing, saturating_rate
 from tests.radiation.points import MOUNT, point, through
 
 UP, EAST = jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
@@ -210,6 +211,19 @@ def test_dead_time_laws(library: Library) -> None:
     assert float(rates[best]) + 167 == pytest.approx(1 / tau, rel=0.01)
     assert float(observed_rate(detector, rates[best])) == pytest.approx(1 / (tau * np.e), rel=1e-4)
     assert float(observed_rate(detectors["non_paralyzable"], jnp.float32(1e9))) == pytest.approx(1 / tau, rel=1e-3)
+
+
+def test_a_share_of_the_highest_rate_is_shown_at_the_lowest_rate_that_shows_it(library: Library) -> None:
+    assert rate_showing(with_dead_time(library, model="none"), 0.75) == np.inf
+    # 0.75 / tau is shown at 3 / tau
+    counter = with_dead_time(library, model="non_paralyzable", non_paralyzable_us=5.0)
+    assert rate_showing(counter, 0.75) == pytest.approx(3.0 / 5e-6, rel=1e-5)
+    for taus in ({"paralyzable_us": 5.0}, {"paralyzable_us": 5.0, "non_paralyzable_us": 2.0}):
+        counter = with_dead_time(library, model="hybrid" if len(taus) == 2 else "paralyzable", **taus)
+        rate = rate_showing(counter, 0.75)
+        assert rate < saturating_rate(float(counter.paralyzable_s), float(counter.non_paralyzable_s))
+        shown = float(observed_rate(counter, jnp.float32(rate - float(counter.background_cps))))
+        assert shown == pytest.approx(0.75 * highest_rate(counter), rel=1e-4)
 
 
 def test_poisson_counts(detectors: Detectors) -> None:

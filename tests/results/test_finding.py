@@ -42,7 +42,7 @@ def test_a_saturated_counter_s_answer_has_no_standard_deviations():
         ({"Co-60": 12.3}, "over 95% of the survey area, one would have been noticed from 12 MBq Co-60 on)"),
         ({"Co-60": 12.3, "Am-241": 345.6, "Na-22": 9.87}, "noticed from 9.9 MBq Na-22 to 346 MBq Am-241 on)"),
         ({"Co-60": 12.3, "Pu-239": np.inf}, "noticed from 12 MBq Co-60 on, but none of Pu-239)"),
-        ({"Co-60": np.inf}, "nor would one of any activity have been noticed"),
+        ({"Co-60": np.inf}, "nor would one of any activity in free view have been noticed"),
     ],
 )
 def test_none_comes_with_what_would_have_been_noticed(limits, said):
@@ -54,6 +54,11 @@ def test_none_comes_with_what_would_have_been_noticed(limits, said):
     assert said in doubtful
     assert doubtful.endswith("; but only 40% was measured")
     assert "would have been" not in finding(SURE, ONE, None, hindrance=None, presumed=True, noticed_mbq=limits)
+
+
+def test_an_activity_that_is_less_than_its_error_is_not_told_as_nothing():
+    faint = replace(ONE[0], activity_mbq=0.21, activity_std_mbq=32.0)
+    assert "a source of 0.21 ± 32 MBq Co-60" in finding(SURE, (faint,), None, None, True)
 
 
 @pytest.mark.parametrize(("presumed", "said"), [(True, "nuclide presumed"), (False, "nuclide by the counts")])

@@ -41,7 +41,7 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
 def verdict(
     samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0,
     at_1_m=MappingProxyType({}), presumed=(100.0, 10.0), identified=MappingProxyType({}),
-    suggested="", spectrum_of=0,
+    suggested="", spectrum_of=0, noticed=MappingProxyType({}),
 ):  # fmt: skip
     samples = survey() if samples is None else samples
     n = len(samples.counts)
@@ -50,7 +50,7 @@ def verdict(
         samples, chart(hotspots, rate), limits, np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
         (presumed[0], float(np.log(presumed[1]))), at_1_m, identified, suggested,
-        spectrum_of,
+        spectrum_of, noticed,
     )  # fmt: skip
 
 
@@ -201,9 +201,56 @@ def test_a_weak_source_far_from_others_of_its_nuclide_is_believed() -> None:
     assert verdict(fit=replace(GOOD, strain=300.0)).status == "located"
 
 
+def test_where_not_even_what_is_presumed_would_have_been_noticed_none_is_not_certain() -> None:
+    limits = {"Co-60": 140.0, "Pu-239": 3e4}
+    assert verdict(found=False, hotspots=(), noticed=limits, presumed=(150.0, 10.0)).status == "none"
+    blind = verdict(found=False, hotspots=(), noticed=limits, presumed=(100.0, 10.0))
+    assert blind.status == "incomplete_survey"
+    assert blind.reasons == ("one as presumed, of 100 MBq (knowledge.activity_mbq), would have gone unnoticed",)
+    assert verdict(found=False, hotspots=(), noticed={"Co-60": np.inf}).status == "incomplete_survey"
+    assert verdict(noticed=limits).status == "located"
+
+
+def test_a_nuclide_that_neither_counts_nor_a_spectrum_are_sure_of_is_doubtful() -> None:
+    """Behind half a metre of soil that nobody presumed, Co-60 was told as Zn-65 with 31 %."""
+    unsure = replace(estimate(), nuclide_confidence=0.31)
+    told = verdict(final=(unsure,))
+    assert told.status == "ambiguous"
+    assert told.reasons == ("the Co-60 source may be of another nuclide (31% by the counts)",)
+    assert verdict(final=(unsure,), suggested="Co-60").status == "located"
+    # the spectrum is that of the first
+    assert verdict(final=(estimate(), replace(unsure, position_m=np.array([40.0, 0, 1])))).status == "ambiguous"
+    assert verdict(final=(replace(unsure, nuclide_confidence=0.95),)).status == "located"
+
+
+def test_counts_of_a_nuclide_that_is_not_in_question_are_told() -> None:
+    none = {"found": False, "hotspots": ()}
+    assert verdict(**none, fit=replace(GOOD, strangers=0.9)).status == "none"
+    told = verdict(**none, fit=replace(GOOD, strangers=1.1))
+    assert told.status == "inconsistent"
+    assert told.reasons == ("the counts show a source of a nuclide that is not in question (knowledge.nuclides)",)
+    # what the model does not know of a strong source looks like others beside it
+    assert verdict(fit=replace(GOOD, strangers=9.0)).status == "located"
+
+
+def test_where_a_counter_was_saturated_no_error_of_a_place_is_told() -> None:
+    far = (estimate(std=35.0),)
+    assert verdict(final=far).status == "detected"
+    told = verdict(final=far, fit=replace(GOOD, load=2.0))
+    assert told.status == "saturated"
+    assert not any("known to" in reason for reason in told.reasons)
+
+
 def test_a_counter_is_saturated_short_of_its_highest_rate() -> None:
     assert verdict(samples=survey(rate=0.7 * 184e3)).status == "located"
     assert verdict(samples=survey(rate=0.8 * 184e3)).status == "saturated"
+
+
+def test_a_counter_that_was_paralysed_by_what_was_found_is_saturated() -> None:
+    """It may have shown ordinary rates all the time: the case is of 10^5 MBq, which none of its rates told."""
+    assert verdict(fit=replace(GOOD, load=0.9)).status == "located"
+    assert verdict(fit=replace(GOOD, load=1.1)).status == "saturated"
+    assert verdict(fit=replace(GOOD, load=1.1, misfit=300.0, chi_squared=7.0)).status == "saturated"
 
 
 def test_a_survey_that_stated_a_place_too_well_is_told() -> None:
@@ -262,3 +309,14 @@ def test_coverage_is_the_share_of_the_area_near_a_measurement() -> None:
     on_ground = replace(survey(), position_m=survey().position_m * [1, 1, 0])
     assert coverage(on_ground, chart(), np.zeros(7 * 60)) > 0.95
     assert coverage(survey().rows(slice(0, 0)), chart(), np.zeros(0)) == 0.0
+
+
+def test_coverage_is_that_of_the_area_alone() -> None:
+    """A survey of a triangle was said to have measured two thirds of it: the rest of the map is not asked for."""
+    half = 0.5 * SIDE_M
+    west = np.array([[-half, -half], [0.0, -half], [-half, half]])
+    east = np.array([[half, -half], [half, half], [half - 20.0, half]])
+    quarter, ground = survey(share=0.25), np.zeros(7 * 60)
+    assert coverage(quarter, chart(), ground, (west,)) == 1.0
+    assert coverage(quarter, chart(), ground, (east,)) == 0.0
+    assert 0.5 < coverage(quarter, chart(), ground, (west, east)) < 0.8
