@@ -16,7 +16,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
 from swarmsim.playback import plan
@@ -132,10 +132,11 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
                       markeredgecolor="black", markeredgewidth=1.0, label="hotspot", zorder=6)  # fmt: skip
         plan.draw_truth(axes, record)
         plan.draw_estimate(axes, record.survey_estimate, "survey estimate")
-    std = f"median standard deviation {np.median(made.std_cps):.2g}"
-    plan.colour_bar(figure, shown[-1], image, f"Count rate, interpolated [1/s]\n({std})")
+    plan.colour_bar(figure, shown[-1], image, "Count rate, interpolated [1/s]")
     handles, _ = whole.get_legend_handles_labels()
-    plan.legend_above(whole, 2, [*handles, Line2D([], [], color="0.2", linewidth=0.7, label="obstacles")])
+    handles.append(Line2D([], [], color="0.2", linewidth=0.7, label="obstacles"))
+    std = f"median standard deviation {np.median(made.std_cps):.2g} 1/s"
+    plan.legend_above(whole, 1 + len(shown), [*handles, Line2D([], [], linestyle="none", label=std)])
     return figure
 
 
@@ -152,8 +153,12 @@ def _draw_map(axes: Axes, made: RadiationMap) -> AxesImage:
         made.mean_cps, norm=norm, extent=extent, origin="lower", cmap=RATE_MAP, interpolation="bilinear", zorder=2
     )
     if min(nx, ny) > 1 and high - low > 1e-3 * max(abs(high), 1.0):
-        lines = axes.contour(x, y, made.mean_cps, levels=6, colors="white", linewidths=0.5, zorder=3)
-        axes.clabel(lines, list(lines.levels)[1:4], fmt="%.0f", fontsize=7.0)
+        # none where the map is cut off
+        levels = [
+            float(level) for level in MaxNLocator(6).tick_values(low, high) if low + 0.02 * (high - low) < level < high
+        ]
+        lines = axes.contour(x, y, made.mean_cps, levels=levels, colors="white", linewidths=0.5, zorder=3)
+        axes.clabel(lines, levels[:3], fmt="%.0f", fontsize=7.0)
     axes.set_xlim(limits[0])
     axes.set_ylim(limits[1])
     return image

@@ -13,6 +13,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Patch
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
 from swarmsim.playback.colours import ESTIMATE, TRUTH
@@ -192,9 +193,12 @@ def colour_bar(
     """A slim colour bar along the right of ``axes``, as high as they are; with an arrow where values exceed it."""
     axes.apply_aspect()
     box = axes.get_position()
-    bar_axes = figure.add_axes((box.x1 + 0.08 / figure.get_figwidth(), box.y0, 0.1 / figure.get_figwidth(), box.height))
+    bar_axes = figure.add_axes((box.x1 + 0.05 / figure.get_figwidth(), box.y0, 0.1 / figure.get_figwidth(), box.height))
     bar = figure.colorbar(mappable, cax=bar_axes, extend=extend)  # type: ignore[arg-type]
     bar.set_label(label)
+    if isinstance(bar.formatter, ScalarFormatter):  # ticks of many digits would push the label off the figure
+        bar.formatter.set_powerlimits((-3, 4))
+        bar.formatter.set_useMathText(True)
     bar.outline.set_linewidth(0.6)  # type: ignore[operator]
     return bar_axes
 
@@ -235,7 +239,7 @@ def draw_estimate(axes: Axes, estimate: Estimate | None, label: str) -> None:
     if estimate is None:
         return
     centre = estimate.position_m[:2]
-    label = f"{label}, 95 % ellipse" if estimate.errors_known else label
+    label = f"{label}, 95 % ellipse" if estimate.errors_known else f"{label} (saturated counter)"
     axes.plot(*centre, linestyle="none", marker="o", markersize=3.0, color=ESTIMATE, markeredgecolor="white",
               markeredgewidth=0.4, label=label, zorder=8)  # fmt: skip
     if not estimate.errors_known:

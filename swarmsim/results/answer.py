@@ -199,6 +199,8 @@ def _verdict(
     )
     site = simulation.site_model.site
     ground = height_at(site, np.asarray(samples.position_m, float)[:, :2])
+    below = height_at(site, np.array([one.position_m[:2] for one in final]).reshape(-1, 2))
+    height_m, height_std_m = float(presumed.height_m), max(float(presumed.height_std_m), LEAST_STD_M)
     return assess(
         samples,
         chart,
@@ -215,6 +217,7 @@ def _verdict(
         examined,
         noticed,
         mapped_areas(simulation.scenario, site.survey_area_m),
+        [(float(one.position_m[2] - z) - height_m) / height_std_m for one, z in zip(final, below, strict=True)],
     )
 
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from swarmsim.estimation.detection_limit import MOST
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
+from swarmsim.results.doubts import CONFIRMED, in_mbq
 from swarmsim.results.record import Estimate, Spectrum
-from swarmsim.results.status import CONFIRMED, Verdict, in_mbq
+from swarmsim.results.status import Verdict
 
 NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"

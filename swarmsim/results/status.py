@@ -4,20 +4,27 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from swarmsim.estimation.pairs import COMPANION_M, ONE_M
+from swarmsim.estimation.pairs import COMPANION_M
+from swarmsim.results.doubts import (
+    Status,
+    apart_m,
+    companions,
+    contradicted,
+    implausible,
+    in_mbq,
+    mixed,
+    out_of_reach,
+    unnamed,
+)
 from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
 from swarmsim.site.areas import within
 
 Floats = NDArray[np.floating]
-Status = Literal[
-    "located", "ambiguous", "detected", "none", "saturated", "inconsistent", "incomplete_survey", "not_sought"
-]
 CERTAIN: tuple[Status, ...] = ("located", "none", "not_sought")
 """Statuses that stand for an answer; with the others ``swarmsim run --strict`` ends with 3."""
 
@@ -28,21 +35,12 @@ REACH_HEIGHTS = 1.0  # a measurement covers the ground around it up to its own h
 REACH_M = 8.0
 FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
-COMPANION_SHARE = 0.25  # of the stronger one's activity
-FAINT_SHARE, FAINT_M = 0.01, 25.0  # a source so faint beside one so near adds less than what the model may be off by
-WEAK_DETECTION = 200.0
-"""Twice a logarithm of a likelihood ratio that errors of the model of walls have as well, near a source of the nuclide.
-
-The false ones 10 to 15 m from sources in barns had 76 and 80; 61 is asked of any (`localisation.further_sigma`).
-"""
 STRAINED = 350.0
 """What rates depart from the sources as modelled by beyond what is usual, in twice a log prior, at most.
 
 Of 300 missions, good answers had up to 200, but for one of 400 in a barn; wrong ones in barns and two sources in the
 place of one 400 to 1300.
 """
-CONFIRMED = 0.9  # probability in the spectrum taken near it, above which a nuclide of several in one place is believed
-IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 STRANGERS = "the counts show a source of a nuclide that is not in question (knowledge.nuclides)"
@@ -86,6 +84,7 @@ def assess(
     spectrum_of: int = 0,
     noticed_mbq: Mapping[str, float] = MappingProxyType({}),
     areas_m: Sequence[Floats] = (),
+    heights: Sequence[float] = (),
 ) -> Verdict:
     """Judge an answer.
 
@@ -104,6 +103,7 @@ def assess(
         suggested: the nuclide that the spectrum is of, or "unknown"; empty where none was taken or it shows none.
         spectrum_of: number of the source near which it was taken (`source_of_spectrum`).
         noticed_mbq: activities from which on nuclides would have been noticed (`MissionRecord.noticed_mbq`).
+        heights: of ``final`` above the ground, in standard deviations from what is presumed.
         areas_m: that were to be surveyed, convex polygons with corners [V, 2]; by default all that is mapped.
     """
     covered = coverage(samples, chart, ground_m, areas_m)
@@ -121,8 +121,8 @@ def assess(
     strength = [one.activity_mbq * at_1_m[one.nuclide].kerma_ugy_h if at_1_m else one.activity_mbq for one in final]
     doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity)
     examined = final[spectrum_of] if final else None
-    doubts += _mixed(final, examined, identified) + _contradicted(examined, suggested)
-    doubts += _unnamed(final, examined, suggested)
+    doubts += mixed(final, examined, identified) + contradicted(examined, suggested)
+    doubts += unnamed(final, examined, suggested) + out_of_reach(final, heights)
     if not final and fit.strangers > 1.0:
         doubts.append(("inconsistent", STRANGERS))
     if doubts and status in ("located", "none"):
@@ -199,35 +199,9 @@ def _doubts(
         std = np.sqrt(np.maximum(np.linalg.eigvalsh(np.asarray(one.covariance_m2)[:2, :2])[-1], 0.0))
         if std > FAR_STD_M:
             found.append(("detected", f"the place of the {one.nuclide} source is known to {std:.0f} m only"))
-    found += _companions(final, strength)
-    found += _implausible(final, *activity)
+    found += companions(final, strength)
+    found += implausible(final, *activity)
     found += _unexplained(chart, final, background_std)
-    return found
-
-
-def in_mbq(activity_mbq: float) -> str:
-    """An activity in words, with two digits at least: that of a faint source is not zero."""
-    return f"{activity_mbq:.0f} MBq" if activity_mbq >= 10.0 else f"{activity_mbq:.2g} MBq"
-
-
-def _companions(final: Sequence[Estimate], strength: Sequence[float]) -> list[tuple[Status, str]]:
-    """Faint sources beside a strong one of the same nuclide, or any two at one place: errors of the model of walls."""
-    found: list[tuple[Status, str]] = []
-    for pair in itertools.combinations(zip(final, strength, strict=True), 2):
-        (faint, less), (strong, more) = sorted(pair, key=lambda one: one[1])
-        apart = _apart_m(faint, strong)
-        share = less / max(more, 1e-30)
-        alike = faint.nuclide == strong.nuclide and (
-            apart < (COMPANION_M if share < COMPANION_SHARE else ONE_M)
-            or (apart < FAINT_M and faint.detection < WEAK_DETECTION)
-        )
-        # what the model does not explain about a source is taken up by others near it, of any nuclide
-        several = max(strong.joined_m, faint.joined_m) > 0.0 and apart < COMPANION_M
-        taken_up = several or (share < FAINT_SHARE and apart < FAINT_M)
-        if alike or taken_up:
-            other = "a stronger one" if share < 1.0 else "another one"
-            text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
-            found.append(("ambiguous", f"{text} may be an error of the model"))
     return found
 
 
@@ -239,65 +213,9 @@ def source_of_spectrum(taken_at: Estimate | None, final: Sequence[Estimate], rad
     """
     if taken_at is None or not final:
         return None
-    apart = [_apart_m(one, taken_at) for one in final]
+    apart = [apart_m(one, taken_at) for one in final]
     nearest = int(np.argmin(apart))
     return nearest if apart[nearest] < radius_m else None
-
-
-def _mixed(
-    final: Sequence[Estimate], examined: Estimate | None, identified: Mapping[str, float]
-) -> list[tuple[Status, str]]:
-    """Different nuclides in one place: few energy windows tell two of them from a third one, which a spectrum does."""
-    found: list[tuple[Status, str]] = []
-    for one, other in itertools.combinations(final, 2):
-        apart, names = _apart_m(one, other), (one.nuclide, other.nuclide)
-        shown = any(x is examined for x in (one, other)) and all(
-            identified.get(name, 0.0) > CONFIRMED for name in names
-        )
-        if names[0] != names[1] and apart < ONE_M and not shown:
-            text = f"the {names[0]} and {names[1]} sources {apart:.2g} m apart may be one of another nuclide"
-            found.append(("ambiguous", text))
-    return found
-
-
-def _contradicted(examined: Estimate | None, suggested: str) -> list[tuple[Status, str]]:
-    """A spectrum of another nuclide than that under which the source was sought near which it was taken.
-
-    None of 222 located missions of `random_recon` had one; before, a weak source beside a strong one 4 standard
-    deviations from its place did.
-    """
-    if examined is None or suggested in ("", examined.nuclide):
-        return []
-    other = "none in the library" if suggested == "unknown" else suggested
-    return [("ambiguous", f"the spectrum taken near the {examined.nuclide} source is of {other}")]
-
-
-def _unnamed(final: Sequence[Estimate], examined: Estimate | None, suggested: str) -> list[tuple[Status, str]]:
-    """Sources whose nuclide neither the counts nor a spectrum is sure of: the place follows from the nuclide.
-
-    What lies above a source may be other than presumed: of twelve that were buried six were told as of another nuclide.
-    """
-    return [
-        (
-            "ambiguous",
-            f"the {one.nuclide} source may be of another nuclide ({one.nuclide_confidence:.0%} by the counts)",
-        )
-        for one in final
-        if one.nuclide_confidence < CONFIRMED and not (one is examined and suggested == one.nuclide)
-    ]
-
-
-def _implausible(final: Sequence[Estimate], presumed_mbq: float, std: float) -> list[tuple[Status, str]]:
-    """Sources far weaker or stronger than presumed: close to a vehicle a slight error of the model looks like one."""
-    found: list[tuple[Status, str]] = []
-    for one in final:
-        ratio = max(one.activity_mbq, 1e-12) / presumed_mbq
-        if abs(np.log(ratio)) > IMPLAUSIBLE_SIGMA * std:
-            times = float(f"{max(ratio, 1.0 / ratio):.2g}")
-            compared = f"{times:,.6g} times {'stronger' if ratio > 1.0 else 'weaker'}"
-            text = f"the {one.nuclide} source of {in_mbq(one.activity_mbq)} is {compared} than presumed"
-            found.append(("ambiguous", f"{text} (knowledge.activity_mbq), and may be an error of the model"))
-    return found
 
 
 def _unexplained(chart: RadiationMap, final: Sequence[Estimate], background_std: float) -> list[tuple[Status, str]]:
@@ -371,7 +289,7 @@ def _contradiction(first: Sequence[Estimate], last: Sequence[Estimate]) -> str:
 def _of_all_counts(before: Estimate, sources: Sequence[Estimate]) -> Estimate | None:
     """The nearest of the ``sources`` by all counts that is of the nuclide of one of the survey; None without any."""
     alike = [one for one in sources if one.nuclide == before.nuclide]
-    return min(alike, key=lambda one: _apart_m(one, before), default=None)
+    return min(alike, key=lambda one: apart_m(one, before), default=None)
 
 
 def _off(first: Sequence[Estimate], last: Sequence[Estimate], model_std_m: float) -> tuple[float, float]:
@@ -381,15 +299,11 @@ def _off(first: Sequence[Estimate], last: Sequence[Estimate], model_std_m: float
     return float(np.linalg.norm(apart)), float(np.sqrt(apart @ np.linalg.solve(covariance, apart)))
 
 
-def _apart_m(one: Estimate, other: Estimate) -> float:
-    return float(np.linalg.norm(np.asarray(one.position_m, float)[:2] - np.asarray(other.position_m, float)[:2]))
-
-
 def _beside(one: Estimate, found: Sequence[Estimate]) -> list[Estimate]:
     """It, and those of its nuclide that are so near that their rates rise and fall with its own."""
     return [one] + [
         other for other in found
-        if other is not one and other.nuclide == one.nuclide and _apart_m(other, one) < COMPANION_M
+        if other is not one and other.nuclide == one.nuclide and apart_m(other, one) < COMPANION_M
     ]  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection, PolyCollection
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.text import Text
@@ -94,7 +95,7 @@ def test_map_shows_truth_hotspot_and_the_ellipse_of_95_percent(found: MissionRec
         assert ellipse.height == pytest.approx(2 * np.sqrt(5.991 * variances[0]), rel=1e-3)
     assert (*whole.get_xlim(), *whole.get_ylim()) == pytest.approx((-75, 75, -60, 60))
     assert {"hotspot", "true source", "survey estimate, 95 % ellipse"} <= set(labels(whole))
-    assert any(text.startswith("Count rate, interpolated [1/s]\n(median standard deviation ") for text in texts(figure))
+    assert any(text.startswith("median standard deviation ") for text in texts(figure))
     contours = [text for text in texts(figure) if text.isdigit() and 95 < int(text) < 240]
     assert len(contours) >= 2
 
@@ -138,7 +139,8 @@ def test_an_estimate_whose_errors_are_not_known_has_no_ellipse(found: MissionRec
     figure = figures.radiation_map(dataclasses.replace(found, survey_estimate=doubtful), site)
     for axes in figure.axes[:2]:
         assert not [p for p in axes.patches if isinstance(p, Ellipse)]
-    assert "survey estimate" in labels(figure.axes[0])
+    assert "survey estimate (saturated counter)" in labels(figure.axes[0])
+    check_print(figure)
 
 
 def test_ellipse_holds_95_percent_of_a_normal_distribution(found: MissionRecord) -> None:
@@ -243,6 +245,20 @@ def test_print_quality(name: str, found: MissionRecord, site: SiteModel) -> None
     check_print(figure)
 
 
+@pytest.mark.parametrize("times", [1.0, 3e4])
+def test_rates_of_many_digits_leave_room_for_their_label(times: float, found: MissionRecord, site: SiteModel) -> None:
+    """A map that was cut off at nothing has no contour along the cut."""
+    assert found.map is not None
+    samples = dataclasses.replace(found.samples, counts=times * np.asarray(found.samples.counts))
+    cells = np.maximum(times * (found.map.mean_cps - np.median(found.map.mean_cps)), 0.0)
+    loud = dataclasses.replace(found, samples=samples, map=dataclasses.replace(found.map, mean_cps=cells))
+    check_print(figures.figures_of(loud)["measurements_survey"](loud, site))
+    figure = figures.radiation_map(loud, site)
+    check_print(figure)
+    (contours,) = [c for c in figure.axes[0].collections if isinstance(c, QuadContourSet)]
+    assert min(contours.levels) > 0.0
+
+
 @pytest.mark.parametrize("count", [1, 12, 13])
 def test_trajectories_of_any_team_have_room_for_their_legend(count: int, site: SiteModel) -> None:
     team = synthetic.swarm(count, 30.0)
@@ -281,8 +297,10 @@ def test_written_at_300_dpi(found: MissionRecord, site: SiteModel, tmp_path: Pat
 def test_mission_without_a_source(nothing: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
     written = figures.write(nothing, site, tmp_path)
     assert [path.stem for path in written] == ["trajectories", "measurements_survey", "radiation_map"]
-    whole, *others = figures.radiation_map(nothing, site).axes
-    assert labels(whole) == ["obstacles"]
+    figure = figures.radiation_map(nothing, site)
+    check_print(figure)
+    whole, *others = figure.axes
+    assert labels(whole) == ["obstacles", "median standard deviation 1.8 1/s"]
     assert (*whole.get_xlim(), *whole.get_ylim()) == pytest.approx((-75, 75, -60, 60))
     # an even map is one colour; there is nothing to show close up
     assert whole.images[-1].norm.vmax > whole.images[-1].norm.vmin

@@ -41,7 +41,7 @@ def estimate(x: float = 0.0, std: float = 0.5, activity: float = 170.0, nuclide:
 def verdict(
     samples=None, hotspots=((0.0, 0.0),), found=True, fit=GOOD, aerial=None, final=None, highest=184e3, rate=400.0,
     at_1_m=MappingProxyType({}), presumed=(100.0, 10.0), identified=MappingProxyType({}),
-    suggested="", spectrum_of=0, noticed=MappingProxyType({}),
+    suggested="", spectrum_of=0, noticed=MappingProxyType({}), heights=(),
 ):  # fmt: skip
     samples = survey() if samples is None else samples
     n = len(samples.counts)
@@ -50,7 +50,7 @@ def verdict(
         samples, chart(hotspots, rate), limits, np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
         (presumed[0], float(np.log(presumed[1]))), at_1_m, identified, suggested,
-        spectrum_of, noticed,
+        spectrum_of, noticed, heights=heights,
     )  # fmt: skip
 
 
@@ -221,6 +221,14 @@ def test_a_nuclide_that_neither_counts_nor_a_spectrum_are_sure_of_is_doubtful() 
     # the spectrum is that of the first
     assert verdict(final=(estimate(), replace(unsure, position_m=np.array([40.0, 0, 1])))).status == "ambiguous"
     assert verdict(final=(replace(unsure, nuclide_confidence=0.95),)).status == "located"
+
+
+def test_a_source_far_from_the_height_presumed_is_doubtful() -> None:
+    """One buried 0.6 m was told 6 m off, at a height 3.8 standard deviations from what was presumed."""
+    told = verdict(heights=(-3.8,))
+    assert told.status == "ambiguous"
+    assert told.reasons[0].startswith("the height of the Co-60 source is 3.8 standard deviations from what is presumed")
+    assert verdict(heights=(2.4,)).status == "located"
 
 
 def test_counts_of_a_nuclide_that_is_not_in_question_are_told() -> None:
