@@ -54,12 +54,17 @@ class DoseOperator:
     non_paralyzable_s: float
 
     def rates(self, counts: Floats, exposure_s: Floats) -> DoseRates:
-        """Dose rates from ``counts`` [n, R] of exposures [n]; those of a saturated detector are lower bounds."""
-        live = exposure_s * self._live_share(np.asarray(counts, float).sum(axis=1) / exposure_s)
+        """Dose rates from ``counts`` [n, R] of exposures [n]; those of a saturated detector are lower bounds.
+
+        The standard deviation of no count at all is that of one.
+        """
+        total = np.asarray(counts, float).sum(axis=1)
+        live = exposure_s * self._live_share(total / exposure_s)
+        variance = counts @ self.ambient**2 + np.where(total > 0.0, 0.0, np.mean(self.ambient**2))
         return DoseRates(
             live_s=live,
             ambient_usv_h=counts @ self.ambient / live,
-            ambient_std_usv_h=np.sqrt(counts @ self.ambient**2) / live,
+            ambient_std_usv_h=np.sqrt(variance) / live,
             kerma_ugy_h=counts @ self.kerma / live,
         )
 

@@ -259,7 +259,8 @@ def dose_summary(record: MissionRecord) -> dict[str, Any] | None:
 
     Natural background is included. It is the reading that is greatest less two standard deviations: of thousands of
     readings of a few counts each, the greatest one is chance. The standard deviation is that of counting alone, without
-    the error of the conversion (see `swarmsim.radiation.dose_operator`).
+    the error of the conversion (see `swarmsim.radiation.dose_operator`). Where a counter was saturated there is none,
+    and the rates are ``lower_bounds``: a paralysed counter shows little where there is much.
     """
     samples = record.samples
     ambient, std, kerma = samples.dose_rate_usv_h, samples.dose_rate_std_usv_h, samples.kerma_rate_ugy_h
@@ -269,7 +270,8 @@ def dose_summary(record: MissionRecord) -> dict[str, Any] | None:
     return {
         "basis": "counts",
         "greatest_usv_h": float(ambient[best]),
-        "greatest_std_usv_h": float(std[best]),
+        "greatest_std_usv_h": None if record.status == "saturated" else float(std[best]),
+        "lower_bounds": record.status == "saturated",
         "greatest_kerma_ugy_h": float(kerma[best]),
         "vehicle": record.vehicles[int(samples.vehicle[best])].name,
         "time_s": float(samples.time_s[best]),

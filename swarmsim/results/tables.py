@@ -21,7 +21,7 @@ _MEASURED = (
     "window); exposure_s is the real time that counts stand for, dead time included (1 s for an idealised one), and "
     "count_rate_cps the counts over it; live_s is the live time, the exposure less the dead time by the detector's "
     "law; dose rates are ambient dose equivalent H*(10) and air kerma by the counts over the live time, background "
-    "included"
+    "included, and lower bounds where the counter was saturated"
 )
 _SPECTRUM = (
     "spectrum that the nuclide was identified by, summed over samples near the source (energy: centre of the channel) "
@@ -35,7 +35,9 @@ _MISSIONS = (
     "that it was estimated as; std_ the standard deviations, covariance_ the covariances of the place, error_m the "
     "distance to the nearest true source, true_nuclide that one's); true_thickness_factor_MATERIAL and "
     "true_sensitivity_factor_DETECTOR true over presumed, as drawn for it; sources_found how many; nuclide and "
-    "nuclide_confidence of the spectrum taken near it; success whether the answer is right and nothing went wrong"
+    "nuclide_confidence of the spectrum taken near it; noticed_least_mbq and noticed_most_mbq the activities from "
+    "which on the nuclides in question that are noticed first and last would have been (null: never); success whether "
+    "the answer is right and nothing went wrong"
 )
 
 

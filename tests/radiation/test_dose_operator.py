@@ -109,6 +109,12 @@ def test_a_saturated_detector_has_a_finite_reading(operator: DoseOperator) -> No
     assert 0.0 < found.live_s[0] < 1.0
 
 
+def test_no_count_at_all_is_not_certain(operator: DoseOperator) -> None:
+    none, one = (operator.rates(counts, np.ones(14)) for counts in (np.zeros((14, 14)), np.eye(14)))
+    assert np.all(none.ambient_usv_h == 0.0)
+    np.testing.assert_allclose(none.ambient_std_usv_h**2, np.mean(one.ambient_usv_h**2), rtol=1e-4)
+
+
 def test_the_standard_deviation_is_that_of_the_counts(operator: DoseOperator) -> None:
     mean = np.geomspace(20.0, 1.0, 14)
     counts = np.random.default_rng(2).poisson(mean, (20_000, 14))

@@ -120,6 +120,13 @@ def test_dose_rates_are_those_of_the_source(record: swarmsim.MissionRecord) -> N
     surely = samples.dose_rate_usv_h - 2.0 * samples.dose_rate_std_usv_h
     assert told["dose_rate"]["greatest_usv_h"] == pytest.approx(samples.dose_rate_usv_h[np.argmax(surely)])
     assert json.dumps(told["dose_rate"])
+    assert told["dose_rate"]["greatest_std_usv_h"] > 0.0
+    assert not told["dose_rate"]["lower_bounds"]
+    saturated = summary(dataclasses.replace(record, status="saturated"), swarmsim.results.summary.Timings())[
+        "dose_rate"
+    ]
+    assert saturated["greatest_std_usv_h"] is None
+    assert saturated["lower_bounds"]
 
 
 def test_spectra_keep_the_counts_of_every_window(

@@ -117,6 +117,8 @@ def test_what_would_have_been_noticed_is_told_by_nuclide(found: MissionRecord) -
     noticed = dataclasses.replace(found, noticed_mbq={"Co-60": 30.0, "Cs-137": 70.0, "Pu-239": np.inf})
     assert summary(noticed, TIMINGS)["noticed_mbq"] == {"Co-60": 30.0, "Cs-137": 70.0, "Pu-239": None}
     row = batch_row(noticed)
+    assert (row["noticed_least_mbq"], row["noticed_most_mbq"]) == (30.0, None)
+    row = batch_row(dataclasses.replace(found, noticed_mbq={"Cs-137": 70.0, "Co-60": 30.0}))
     assert (row["noticed_least_mbq"], row["noticed_most_mbq"]) == (30.0, 70.0)
     assert batch_row(found)["noticed_least_mbq"] is None
 
