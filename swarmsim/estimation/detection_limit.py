@@ -59,11 +59,25 @@ def noticed(
         weak = order[((1.0 - MOST) * jnp.sum(surveyed)).astype(jnp.int32)]
         faint = jnp.take_along_axis(information, weak[None], axis=0)[0]
         activity = limits(problem, state, points[weak], least_of(params, state), faint)
-        activity = jnp.where(allowed & (activity < 1e6 * ACTIVITY_MAX_MBQ), activity, jnp.inf)
-        return activity, jnp.maximum(jnp.max(scanned.statistic), 0.0) / params.further
+        strangers = jnp.maximum(jnp.max(scanned.statistic), 0.0) / params.further
+        return jnp.where(allowed, possible(activity), jnp.inf), strangers
 
     nothing = (jnp.full(allowed.shape, jnp.inf), jnp.zeros(()))
     return for_those(~jnp.all(state.sources.present), look, lambda: nothing)
+
+
+def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
+    """Activities [K] in Bq from which on another source is noticed, by the information [K] about its activity.
+
+    ``further`` [] is what it must reach. Infinite where it would have to be stronger than any.
+    """
+    activity = (jnp.sqrt(further) + NOTICED) / jnp.sqrt(jnp.maximum(information, 1e-37))
+    return possible(activity)
+
+
+def possible(activity_bq: jax.Array) -> jax.Array:
+    """Activities [...], those that no source has as infinite."""
+    return jnp.where(activity_bq < 1e6 * ACTIVITY_MAX_MBQ, activity_bq, jnp.inf)
 
 
 def limits(problem: Problem, state: State, points_m: jax.Array, asked: jax.Array, information: jax.Array) -> jax.Array:

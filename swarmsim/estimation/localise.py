@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.mission import Knowledge, Localisation
-from swarmsim.config.sources import ACTIVITY_MAX_MBQ
 from swarmsim.device import for_those
-from swarmsim.estimation.detection_limit import NOTICED, noticed
+from swarmsim.estimation.detection_limit import noticed, noticed_from
 from swarmsim.estimation.forward import Problem, models_of, padded, trust_of
 from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.likelihood import natural_background, position_covariance
@@ -337,15 +336,6 @@ def sampled(
     # too few places to tell their spread: it must not look small
     unsure = jnp.where(converged, 0.0, jnp.square(UNSURE * reach))
     return converged, mean, covariance + unsure[:, None, None] * jnp.diag(jnp.array([1.0, 1.0, 0.0, 0.0]))
-
-
-def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:
-    """Activities [K] in Bq from which on another source is noticed, by the information [K] about its activity.
-
-    ``further`` [] is what it must reach. Infinite where it would have to be stronger than any.
-    """
-    activity = (jnp.sqrt(further) + NOTICED) / jnp.sqrt(jnp.maximum(information, 1e-37))
-    return jnp.where(activity < 1e6 * ACTIVITY_MAX_MBQ, activity, jnp.inf)
 
 
 def _report(

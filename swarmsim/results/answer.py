@@ -200,7 +200,7 @@ def _verdict(
     site = simulation.site_model.site
     ground = height_at(site, np.asarray(samples.position_m, float)[:, :2])
     below = height_at(site, np.array([one.position_m[:2] for one in final]).reshape(-1, 2))
-    height_m, height_std_m = float(presumed.height_m), max(float(presumed.height_std_m), LEAST_STD_M)
+    height_m, height_std_m = float(presumed.height_m), float(presumed.height_std_m) or np.inf  # 0: it is held
     return assess(
         samples,
         chart,

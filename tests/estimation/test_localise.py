@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from swarmsim.config.mission import Knowledge
+from swarmsim.estimation.detection_limit import noticed_from
 from swarmsim.estimation.importance_sampling import Posterior
-from swarmsim.estimation.localise import noticed_from, sampled
+from swarmsim.estimation.localise import sampled
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
