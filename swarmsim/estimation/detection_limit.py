@@ -59,8 +59,8 @@ def noticed(
         weak = order[((1.0 - MOST) * jnp.sum(surveyed)).astype(jnp.int32)]
         faint = jnp.take_along_axis(information, weak[None], axis=0)[0]
         activity = limits(problem, state, points[weak], least_of(params, state), faint)
-        strangers = jnp.maximum(jnp.max(scanned.statistic), 0.0) / params.further
-        return jnp.where(allowed, possible(activity), jnp.inf), strangers
+        excluded = jnp.maximum(jnp.max(scanned.statistic), 0.0) / params.further
+        return jnp.where(allowed, possible(activity), jnp.inf), excluded
 
     nothing = (jnp.full(allowed.shape, jnp.inf), jnp.zeros(()))
     return for_those(~jnp.all(state.sources.present), look, lambda: nothing)

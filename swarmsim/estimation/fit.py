@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.config.sources import ACTIVITY_MAX_MBQ
+from swarmsim.device import for_those
 from swarmsim.estimation.forward import Problem, Rates, Ways, lengthened, rates, silent, variance_of
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.estimation.normal_equations import (
@@ -185,7 +186,7 @@ def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u:
             background=jnp.where(same, begun.background, own),
         )
 
-    return jax.lax.cond(overloaded(problem), strong, lambda: begun)
+    return for_those(overloaded(problem), strong, lambda: begun)
 
 
 def alone(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, Linearised]:

@@ -106,7 +106,7 @@ class Estimated:
     highest_cps: jax.Array  # [D] true rate of the window with the most, by the model, of each detector model
     windows: jax.Array  # [] number of valid ones
     noticed_bq: jax.Array  # [N] from which on a further source in free view would have been noticed; inf: never
-    strangers: jax.Array  # [] statistic of a further one of any nuclide not in question, over what is asked of one
+    excluded: jax.Array  # [] statistic of a further one of any nuclide not in question, over what is asked of one
     state: State  # to go on from when there are more counts
 
 
@@ -314,7 +314,7 @@ def nothing_found(
         highest_cps=jnp.zeros(len(presumed.detectors)),
         windows=jnp.int32(0),
         noticed_bq=jnp.zeros(np.shape(presumed.nuclides)),
-        strangers=zero,
+        excluded=zero,
         state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
     )
 
@@ -376,7 +376,7 @@ def _report(
     )
     strained, usual = strain(problem, state)
     rate = jnp.sum(true_counts(problem, state.added, state.unknowns), axis=1) / jnp.maximum(m.exposure_s, 1e-9)
-    limits_bq, strangers = for_those(
+    limits_bq, excluded = for_those(
         jnp.asarray(limits),
         lambda: noticed(problem, presumed.places, presumed.nuclides, params.search, state),
         lambda: (jnp.full(jnp.shape(presumed.nuclides), jnp.inf), jnp.zeros(())),
@@ -395,6 +395,6 @@ def _report(
         highest_cps=jnp.max(jnp.where(m.valid, rate, 0.0)[:, None] * problem.detector, axis=0),
         windows=jnp.sum(m.valid),
         noticed_bq=limits_bq,
-        strangers=strangers,
+        excluded=excluded,
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -13,7 +13,7 @@ from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others
 from swarmsim.radiation.rate import share_registered
 
 OVERLOADED = 0.1  # of the time a counter is dead in some window, from which on it may have been paralysed in others
-SHARE = 0.3  # of the rate of the other sources in some window, that a further one adds
+LEAST_SHARE = 0.3  # of the rate of the other sources in some window, that a further one adds
 FACTORS = 1.6 ** np.arange(24, dtype=np.float32)  # of an activity, that are tried
 
 
@@ -27,12 +27,12 @@ def overloaded(problem: Problem) -> jax.Array:
 def prominent(problem: Problem, own: jax.Array, others: Others) -> jax.Array:
     """Whether [] a further source adds [n, R] counts that may be believed beside ``others``.
 
-    Where counters were overloaded it has to add `SHARE` of all others in some window: by less the dead time, and the
-    rate within a window, may be other than modelled.
+    Where counters were overloaded it has to add `LEAST_SHARE` of all others in some window: by less the dead time, and
+    the rate within a window, may be other than modelled.
     """
     valid, rest = problem.measurements.valid, jnp.sum(others.counts, axis=(0, 2))
     share = jnp.where(valid, jnp.sum(own, axis=1) / jnp.maximum(rest, MEAN_FLOOR), 0.0)
-    return ~overloaded(problem) | (jnp.max(share) > SHARE)
+    return ~overloaded(problem) | (jnp.max(share) > LEAST_SHARE)
 
 
 def likeliest(

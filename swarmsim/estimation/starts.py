@@ -19,8 +19,8 @@ from swarmsim.estimation.overload import likeliest_source, overloaded
 from swarmsim.estimation.scan import open_totals, scan, strongest
 from swarmsim.pytree import on_host, pytree
 from swarmsim.site import Site
-from swarmsim.site.areas import within
 from swarmsim.site.model import height_at
+from swarmsim.site.raster import in_areas
 from swarmsim.site.rooms import rooms_of
 
 STARTS = 8  # grid points that are tried for a further source
@@ -75,7 +75,7 @@ def places_of(site: Site, areas_m: Sequence[np.ndarray], step_m: float, height_m
         inside_m=on_host(inside),
         near=on_host(near, np.int32),
         there=on_host(there, bool),
-        surveyed=on_host(within(areas_m, xy), bool),
+        surveyed=on_host(in_areas(xy, areas_m), bool),
     )
 
 

@@ -18,7 +18,7 @@ from swarmsim.radiation.cylinder import fit_effective_area
 from swarmsim.radiation.detector import counting_of, rois_of
 from swarmsim.radiation.dose import MICRO_PER_HOUR, Quantity, per_fluence
 from swarmsim.radiation.library import Library
-from swarmsim.radiation.rate import saturating_rate
+from swarmsim.radiation.rate import saturating_rate, shown
 from swarmsim.radiation.response import REFERENCE_KEV, build_response, line_spectra, normalised
 
 Floats = NDArray[np.float64]
@@ -74,8 +74,8 @@ class DoseOperator:
         if paralyzable <= 0.0:
             return np.asarray(np.maximum(1.0 - observed_cps * non_paralyzable, _LEAST_SHARE))
         true = saturating_rate(paralyzable, non_paralyzable) * np.linspace(0.0, 1.0, _NODES) ** 2
-        share = np.exp(-true * paralyzable) / (1.0 + true * non_paralyzable)
-        return np.interp(observed_cps, true * share, share)
+        registered = shown(true, paralyzable, non_paralyzable)
+        return np.interp(observed_cps, registered, np.concatenate([[1.0], registered[1:] / true[1:]]))
 
 
 def dose_operator(spec: DetectorSpec, library: Library, kind: str) -> DoseOperator:

@@ -10,6 +10,7 @@ share g that the ground adds (`swarmsim.radiation.ground`).
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from swarmsim.radiation.cylinder import NEAR_TABLES, direction_basis, near_ratio
@@ -18,6 +19,8 @@ from swarmsim.radiation.lines import SPECTRUM_DEPTHS
 from swarmsim.radiation.poisson import poisson
 from swarmsim.radiation.walls import Scattered, scattered_counts
 from swarmsim.site.rays import Crossed
+
+Floats = NDArray[np.floating]
 
 INDOORS = 0.1
 """Sine of the elevation at which, in the open, as much comes from the ground as out of a building with thick walls."""
@@ -177,13 +180,19 @@ def share_registered(rate_cps: jax.Array, paralyzable_s: jax.Array, non_paralyza
     return jnp.exp(-rate_cps * paralyzable_s) / (1.0 + rate_cps * non_paralyzable_s)
 
 
+def shown(rate_cps: Floats | float, paralyzable_s: float, non_paralyzable_s: float) -> Floats:
+    """Rate that is registered of true ones [...], by the law of `registered_share`, in float64 (host)."""
+    rate = np.asarray(rate_cps, float)
+    return np.asarray(rate * np.exp(-rate * paralyzable_s) / (1.0 + rate * non_paralyzable_s))
+
+
 def highest_rate(detector: Detector) -> float:
     """Largest rate that the detector can show; inf without dead time (host)."""
     paralyzable, non_paralyzable = float(detector.paralyzable_s), float(detector.non_paralyzable_s)
     if paralyzable <= 0.0:
         return np.inf if non_paralyzable <= 0.0 else 1.0 / non_paralyzable
     n = saturating_rate(paralyzable, non_paralyzable)
-    return float(n * np.exp(-n * paralyzable) / (1.0 + n * non_paralyzable))
+    return float(shown(n, paralyzable, non_paralyzable))
 
 
 def saturating_rate(paralyzable_s: float, non_paralyzable_s: float) -> float:
@@ -207,10 +216,8 @@ def rate_showing(detector: Detector, share: float) -> float:
     if paralyzable <= 0.0:
         return wanted / (1.0 - wanted * non_paralyzable)
 
-    def beyond(rate: float) -> float:
-        return rate * np.exp(-rate * paralyzable) / (1.0 + rate * non_paralyzable) - wanted
-
-    return float(brentq(beyond, 0.0, saturating_rate(paralyzable, non_paralyzable)))
+    most = saturating_rate(paralyzable, non_paralyzable)
+    return float(brentq(lambda rate: shown(rate, paralyzable, non_paralyzable) - wanted, 0.0, most))
 
 
 def exposure_of(detector: Detector, period_s: jax.Array | float) -> jax.Array:

@@ -194,7 +194,7 @@ def _verdict(
         misfit=float(estimated.misfit),
         chi_squared=float(estimated.chi_squared),
         strain=float(estimated.strain),
-        strangers=float(estimated.strangers),
+        excluded=float(estimated.excluded),
         load=float(np.max(np.asarray(estimated.highest_cps) / doubtful, initial=0.0)),
     )
     site = simulation.site_model.site

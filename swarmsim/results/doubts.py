@@ -79,7 +79,7 @@ def contradicted(examined: Estimate | None, suggested: str) -> list[tuple[Status
     return [("ambiguous", f"the spectrum taken near the {examined.nuclide} source is of {other}")]
 
 
-def unnamed(final: Sequence[Estimate], examined: Estimate | None, suggested: str) -> list[tuple[Status, str]]:
+def unsure_nuclides(final: Sequence[Estimate], examined: Estimate | None, suggested: str) -> list[tuple[Status, str]]:
     """Sources whose nuclide neither the counts nor a spectrum is sure of: the place follows from the nuclide.
 
     What lies above a source may be other than presumed: of twelve that were buried six were told as of another nuclide.
@@ -94,7 +94,7 @@ def unnamed(final: Sequence[Estimate], examined: Estimate | None, suggested: str
     ]
 
 
-def out_of_reach(final: Sequence[Estimate], heights: Sequence[float]) -> list[tuple[Status, str]]:
+def unusual_heights(final: Sequence[Estimate], heights: Sequence[float]) -> list[tuple[Status, str]]:
     """Sources at a height that is not expected: of buried ones the place may be metres off."""
     return [
         (

@@ -18,11 +18,11 @@ from swarmsim.results.doubts import (
     implausible,
     in_mbq,
     mixed,
-    out_of_reach,
-    unnamed,
+    unsure_nuclides,
+    unusual_heights,
 )
 from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
-from swarmsim.site.areas import within
+from swarmsim.site.raster import in_areas
 
 Floats = NDArray[np.floating]
 CERTAIN: tuple[Status, ...] = ("located", "none", "not_sought")
@@ -43,7 +43,7 @@ place of one 400 to 1300.
 """
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
-STRANGERS = "the counts show a source of a nuclide that is not in question (knowledge.nuclides)"
+EXCLUDED = "the counts show a source of a nuclide that is not in question (knowledge.nuclides)"
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
 UNEXPLAINED_SIGMA = 3.0  # of the background: a hotspot that exceeds it by less may be of the background
 
@@ -55,7 +55,7 @@ class Fit:
     misfit: float  # standard deviations by which chi-squared exceeds its degrees of freedom
     chi_squared: float  # over its degrees of freedom
     strain: float = 0.0  # what rates depart from the model by, beyond what is usual (`Estimated.strain`)
-    strangers: float = 0.0  # `Estimated.strangers`
+    excluded: float = 0.0  # `Estimated.excluded`
     load: float = 0.0  # highest true rate of a counter by them, over that at which it shows `SATURATED_SHARE`
 
 
@@ -122,9 +122,9 @@ def assess(
     doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity)
     examined = final[spectrum_of] if final else None
     doubts += mixed(final, examined, identified) + contradicted(examined, suggested)
-    doubts += unnamed(final, examined, suggested) + out_of_reach(final, heights)
-    if not final and fit.strangers > 1.0:
-        doubts.append(("inconsistent", STRANGERS))
+    doubts += unsure_nuclides(final, examined, suggested) + unusual_heights(final, heights)
+    if not final and fit.excluded > 1.0:
+        doubts.append(("inconsistent", EXCLUDED))
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     if status == "saturated":  # no errors of places are stated
@@ -142,7 +142,7 @@ def coverage(samples: Samples, chart: RadiationMap, ground_m: Floats, areas_m: S
     x = chart.origin_m[0] + chart.cell_m * np.arange(nx)
     y = chart.origin_m[1] + chart.cell_m * np.arange(ny)
     cells = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    inside = within(areas_m, cells)
+    inside = in_areas(cells, areas_m)
     cells = cells[inside] if np.any(inside) else cells
     place = np.asarray(samples.position_m, float)
     if not len(place):

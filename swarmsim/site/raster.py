@@ -1,6 +1,6 @@
 """Rasterisation of triangles: heights of faces at grid points, and cells crossed by edges."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ Integers = NDArray[np.int64]
 
 _CHUNK = 2_000_000  # candidate points per chunk; bounds the memory
 _TOLERANCE = 1e-6  # cells, and share of a triangle
+ON_THE_EDGE = 1e-5  # of the distance to the middle of an area: a place so near to an edge is in it
 
 
 @dataclass(frozen=True)
@@ -209,4 +210,14 @@ def in_polygon(points: Floats, polygon: Floats) -> NDArray[np.bool_]:
     for (ax, ay), (bx, by) in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
         if ay != by:
             inside ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) * (bx - ax) / (by - ay))
+    return inside
+
+
+def in_areas(points: Floats, areas_m: Sequence[NDArray[np.floating]]) -> NDArray[np.bool_]:
+    """Whether each of ``points`` [n, 2] lies in any of ``areas_m``, convex polygons [v, 2], or on an edge."""
+    inside = np.zeros(len(points), bool)
+    for area in areas_m:
+        corners = np.asarray(area, float)
+        middle = corners.mean(axis=0)
+        inside |= in_polygon(points, middle + (1.0 + ON_THE_EDGE) * (corners - middle))
     return inside

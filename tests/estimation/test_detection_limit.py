@@ -122,16 +122,16 @@ def test_a_source_of_another_nuclide_than_those_in_question_shows():
     only = jnp.arange(len(NUCLIDES)) == NUCLIDES.index("I-131")
 
     @jax.jit
-    def strangers(rois, allowed):
+    def excluded(rois, allowed):
         problem, state = _nothing(rois)
         return noticed(problem, KNOWN.places, allowed, SEARCH, state)[1]
 
     rng = np.random.default_rng(3)
     there = mean_rois(SITE, DETECTORS, FLIGHT, [((10.0, 4.0, 1.0), 3e8, "Co-60")])
     silent, loud = (jnp.float32(rng.poisson(np.asarray(mean))) for mean in (BACKGROUND, there))
-    assert float(strangers(loud, only)) > 1.0
-    assert float(strangers(silent, only)) < 0.5
-    assert float(strangers(loud, ALL)) == 0.0
+    assert float(excluded(loud, only)) > 1.0
+    assert float(excluded(silent, only)) < 0.5
+    assert float(excluded(loud, ALL)) == 0.0
 
 
 def test_where_as_many_sources_are_known_as_are_sought_no_further_one_is_noticed():

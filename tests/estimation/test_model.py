@@ -14,8 +14,6 @@ from swarmsim.estimation.fit import settle, without_more
 from swarmsim.estimation.forward import dead_time, lengthened, rates, ways_from, with_one_ray
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.nodes import inverse_square_gain, nodes_of, spans_of
-from swarmsim.estimation.normal_equations import Others
-from swarmsim.estimation.overload import overloaded, prominent
 from swarmsim.estimation.scan import scan
 from swarmsim.estimation.state import no_sources
 from swarmsim.radiation import observed_rate
@@ -235,20 +233,6 @@ def test_dead_time_is_that_of_the_detector(rates, paralyzable, non_paralyzable):
     np.testing.assert_allclose(share * rate, observed_rate(d, rate - d.background_cps), rtol=1e-4, atol=1e-3)
     exact = jax.vmap(jax.grad(lambda n, t: share_of(d, n / t)))(rate * exposure, exposure)
     np.testing.assert_allclose(slope, exact, rtol=1e-3, atol=1e-12)
-
-
-def test_beside_a_source_that_overloads_a_counter_a_faint_one_is_not_believed():
-    known, m = told(place(half=40.0), [])
-    dead_s = float(jnp.sum(DETECTORS[0].paralyzable_s + DETECTORS[0].non_paralyzable_s))
-    added = jnp.linspace(0.0, 1e4, 120)[:, None] * jnp.ones(3)
-    others = Others(counts=jnp.stack([added, 2.0 * added]), variance=jnp.zeros((2, 120)))
-    alone = Others(counts=jnp.zeros((2, 120, 3)), variance=jnp.zeros((2, 120)))
-    for rate, loud in ((0.05 / dead_s, False), (0.15 / dead_s, True)):
-        problem = problem_of(known, replace(m, counts=m.counts.at[7].set(rate * m.exposure_s[7])), SPANS)
-        assert bool(overloaded(problem)) == loud
-        assert bool(prominent(problem, 0.2 * 3.0 * added, others)) != loud
-        assert bool(prominent(problem, (0.2 * 3.0 * added).at[5].mul(2.0), others))
-        assert bool(prominent(problem, 0.01 * added, alone))
 
 
 def share_of(d, rate):

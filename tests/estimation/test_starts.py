@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmsim.estimation.starts import ROOMS, places_of
-from swarmsim.site.areas import within
+from swarmsim.site.raster import in_areas
 from tests.estimation.survey import place
 
 CORNERS = 70.0 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -95,10 +95,10 @@ def test_a_place_in_a_triangle_is_a_mixture_of_its_corners(corners, places):
     triangle = np.array([a, b, c] if twice > 0.0 else [a, c, b])
     shares = np.linalg.solve(np.vstack([triangle.T, np.ones(3)]), np.vstack([np.array(places).T, np.ones(len(places))]))
     clear = np.abs(shares).min(axis=0) > 1e-3
-    assert np.all((within([triangle], places) == (shares > 0.0).all(axis=0))[clear])
+    assert np.all((in_areas(np.array(places), [triangle]) == (shares > 0.0).all(axis=0))[clear])
     elsewhere = triangle + 1e3
-    assert np.array_equal(within([elsewhere, triangle], places), within([triangle], places))
-    assert within([triangle], triangle).all()
+    assert np.array_equal(in_areas(np.array(places), [elsewhere, triangle]), in_areas(np.array(places), [triangle]))
+    assert in_areas(triangle, [triangle]).all()
 
 
 def test_points_outside_of_the_areas_are_not_surveyed():

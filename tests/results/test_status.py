@@ -233,12 +233,12 @@ def test_a_source_far_from_the_height_presumed_is_doubtful() -> None:
 
 def test_counts_of_a_nuclide_that_is_not_in_question_are_told() -> None:
     none = {"found": False, "hotspots": ()}
-    assert verdict(**none, fit=replace(GOOD, strangers=0.9)).status == "none"
-    told = verdict(**none, fit=replace(GOOD, strangers=1.1))
+    assert verdict(**none, fit=replace(GOOD, excluded=0.9)).status == "none"
+    told = verdict(**none, fit=replace(GOOD, excluded=1.1))
     assert told.status == "inconsistent"
     assert told.reasons == ("the counts show a source of a nuclide that is not in question (knowledge.nuclides)",)
     # what the model does not know of a strong source looks like others beside it
-    assert verdict(fit=replace(GOOD, strangers=9.0)).status == "located"
+    assert verdict(fit=replace(GOOD, excluded=9.0)).status == "located"
 
 
 def test_where_a_counter_was_saturated_no_error_of_a_place_is_told() -> None:
