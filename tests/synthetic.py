@@ -273,6 +273,7 @@ def mission(found: bool = True, seed: int = 0, log_hz: float = 20.0, sample_hz: 
         finding="Co-60 source found." if found else "No source above background.",
         status="located" if found else "none",
         covered=1.0,
+        examined=0 if found else None,
     )
 
 

@@ -17,7 +17,8 @@ from swarmsim.device import each, for_those
 from swarmsim.estimation.fit import alone
 from swarmsim.estimation.forward import Problem, dead_time, variance_of
 from swarmsim.estimation.normal_equations import Others, log_likelihood, log_prior, normal_equations
-from swarmsim.estimation.scan import open_counts, scan, true_counts
+from swarmsim.estimation.overload import least_prominent, overloaded
+from swarmsim.estimation.scan import open_counts, open_totals, scan, true_counts
 from swarmsim.estimation.seek import SearchParams, least_of
 from swarmsim.estimation.starts import Places
 from swarmsim.estimation.state import ALONE_STEPS, State
@@ -46,24 +47,39 @@ def noticed(
     """Activities [N] in Bq from which on a source beside those of ``state`` is noticed, at `MOST` of the open places.
 
     Of those in the area. Infinite for nuclides that are not ``allowed`` [N], where it would have to be stronger than
-    any, and where as many sources are known as are sought. And the largest statistic [] that a source of any other
-    nuclide has, over what is asked of a further one (``params.further``).
+    any, and where as many sources are known as are sought. And the largest statistic [] of one that is not sought, over
+    what is asked of a further one (``params.further``): of any other nuclide, and of one that is allowed where as many
+    are known as are sought.
     """
     allowed, points = jnp.asarray(allowed), jnp.asarray(places.points_m)
+    full = jnp.all(state.sources.present)
+    scanned = scan(problem, points, jnp.where(full, allowed, ~allowed), state.added, state.unknowns)
+    unsought = jnp.maximum(jnp.max(scanned.statistic), 0.0) / params.further
 
-    def look() -> tuple[jax.Array, jax.Array]:
-        scanned = scan(problem, points, ~allowed, state.added, state.unknowns)
+    def look() -> jax.Array:
         information, surveyed = scanned.information, jnp.asarray(places.surveyed)
         # in ascending order, those outside of the area last
         order = jnp.argsort(jnp.where(surveyed[:, None], information, jnp.inf), axis=0)
         weak = order[((1.0 - MOST) * jnp.sum(surveyed)).astype(jnp.int32)]
         faint = jnp.take_along_axis(information, weak[None], axis=0)[0]
         activity = limits(problem, state, points[weak], least_of(params, state), faint)
-        excluded = jnp.maximum(jnp.max(scanned.statistic), 0.0) / params.further
-        return jnp.where(allowed, possible(activity), jnp.inf), excluded
+        activity = jnp.maximum(activity, _prominent(problem, points, surveyed, state))
+        return jnp.where(allowed, possible(activity), jnp.inf)
 
-    nothing = (jnp.full(allowed.shape, jnp.inf), jnp.zeros(()))
-    return for_those(~jnp.all(state.sources.present), look, lambda: nothing)
+    return for_those(~full, look, lambda: jnp.full(allowed.shape, jnp.inf)), unsought
+
+
+def _prominent(problem: Problem, points_m: jax.Array, surveyed: jax.Array, state: State) -> jax.Array:
+    """Activities [N] in Bq from which on the search believes in a source at `MOST` of the ``surveyed`` [C] points."""
+    count = points_m.shape[0]
+    hidden = ((1.0 - MOST) * jnp.sum(surveyed)).astype(jnp.int32)
+
+    def of(nuclide: jax.Array) -> jax.Array:
+        least = least_prominent(problem, open_totals(problem, points_m, jnp.full(count, nuclide)), state.added)
+        return -jnp.sort(jnp.where(surveyed, -least, jnp.inf))[hidden]
+
+    nuclides = jnp.arange(problem.detectors[0].decay_1_s.shape[0])
+    return for_those(overloaded(problem), lambda: jax.lax.map(of, nuclides), lambda: jnp.zeros(nuclides.shape))
 
 
 def noticed_from(information: jax.Array, further: jax.Array) -> jax.Array:

@@ -51,7 +51,7 @@ class Problem:
 
 @pytree
 class Rates:
-    """What a source of 1 Bq adds, before dead time."""
+    """What a source of 1 Bq at the start adds, before dead time."""
 
     counts: jax.Array  # [n, R]
     slopes: jax.Array  # [n, U, R] their derivatives by ln(length in each uncertain material)
@@ -77,7 +77,7 @@ def ways_from(problem: Problem, place: jax.Array) -> Ways:
 
 @partial(jax.jit, static_argnames="slopes")  # traced once for all places of a program that call it
 def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array, slopes: bool = True) -> Rates:
-    """Counts per Bq of a source of ``nuclide``.
+    """Counts per Bq at the start of a source of ``nuclide``.
 
     ``lengths`` [U] are logarithms of the factors of the path lengths in the uncertain materials. Without ``slopes``
     (static) there are none: [n, 0, R].
@@ -85,12 +85,19 @@ def rates(problem: Problem, ways: Ways, nuclide: jax.Array, lengths: jax.Array, 
     materials = len(problem.site.material_names)
     factors = jnp.ones(materials).at[jnp.array(problem.uncertain, jnp.int32)].set(jnp.exp(lengths))
     source = Source(position_m=ways.position_m, activity_bq=jnp.ones(()), nuclide=nuclide)
-    by = problem.uncertain if slopes else ()
+    by, exposure_s = problem.uncertain if slopes else (), problem.measurements.exposure_s * left(problem, nuclide)
     parts = [
-        _of_windows(problem, span, nodes, crossed, source, factors, by)
+        _of_windows(problem, span, nodes, crossed, source, factors, by, exposure_s)
         for span, (nodes, crossed) in zip(problem.spans, _by_span(problem, (problem.nodes, ways.crossed)), strict=True)
     ]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+
+def left(problem: Problem, nuclide: jax.Array) -> jax.Array:
+    """Share [..., n] of the activity at the start that is left in the middle of each window, of ``nuclide`` [...]."""
+    m = problem.measurements
+    middle_s = jnp.maximum(m.time_s - 0.5 * m.exposure_s, 0.0)
+    return jnp.exp(-problem.detectors[0].decay_1_s[nuclide][..., None] * middle_s)
 
 
 def _by_span(problem: Problem, x: Any) -> list[Any]:
@@ -107,6 +114,7 @@ def _of_windows(
     source: Source,
     factors: jax.Array,
     by: tuple[int, ...],
+    exposure_s: jax.Array,
 ) -> Rates:
     """The rates of a span's windows; those of spans without a valid one mean nothing."""
     (first, last, number, rays), m = span, problem.measurements
@@ -126,7 +134,7 @@ def _of_windows(
     strength, share = strength.reshape(-1, rays), share.reshape(-1, rays)
     mean = jnp.sum(share * strength, axis=1)
     spread = jnp.sum(share * jnp.square(strength - mean[:, None]), axis=1) / jnp.maximum(jnp.square(mean), 1e-30)
-    exposure, regions = m.exposure_s[first:last], problem.background.shape[1]
+    exposure, regions = exposure_s[first:last], problem.background.shape[1]
     return Rates(
         counts=padded(found.rates, regions) * exposure[:, None],
         slopes=padded(found.slopes, regions) * exposure[:, None, None],

@@ -37,6 +37,7 @@ TAIL = 4.0  # degrees of freedom of the error of a window's rate: a post between
 LINES = 8  # of a nuclide, to which neighbours are put together
 WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
 BLIND_STD = 0.5  # of the logarithm of a window's rate where walls are not known: half of it may be missing
+BLIND_SHARE = 0.1  # of the windows that say something by themselves then: neighbours look through the same walls
 CONVERGED_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
 UNSURE = 0.25  # standard deviation of a place whose posterior could not be sampled, over the reach of the search
@@ -57,7 +58,7 @@ class Presumed:
     log_activity_std: jax.Array  # []
     pose_std_m: jax.Array  # [] of measured places
     place_std_m: jax.Array  # [] error of a source's place that all windows have in common: of poses and walls
-    sensitivity_std: jax.Array  # [] of ln(true over presumed sensitivity) of a detector
+    common_std: jax.Array  # [] of ln(true over modelled rate) of all windows alike: sensitivity, walls not known
     ground_share: jax.Array  # [] of the nominal background, which falls with height
     nuclides: jax.Array  # [N] bool, in question
     places: Places  # where sources are looked for first
@@ -106,7 +107,7 @@ class Estimated:
     highest_cps: jax.Array  # [D] true rate of the window with the most, by the model, of each detector model
     windows: jax.Array  # [] number of valid ones
     noticed_bq: jax.Array  # [N] from which on a further source in free view would have been noticed; inf: never
-    excluded: jax.Array  # [] statistic of a further one of any nuclide not in question, over what is asked of one
+    unsought: jax.Array  # [] statistic of a further one that is not sought, over what is asked of one (`noticed`)
     state: State  # to go on from when there are more counts
 
 
@@ -145,7 +146,8 @@ def presume(
         ground_share: of the nominal background, which comes from the ground.
         areas_m: in which sources are sought, convex polygons with corners [V, 2], counter-clockwise.
     """
-    known, exact = _known_site(site, knowledge), knowledge.site == "exact"
+    known = _known_site(site, knowledge)
+    exact, blind = knowledge.site == "exact", knowledge.site not in ("exact", "geometry")
     used = _materials_of(known)
     names = tuple(known.material_names[i] for i in used)
     new = np.zeros(len(known.material_names), np.int32)
@@ -163,7 +165,7 @@ def presume(
     uncertain = tuple(i for i, name in enumerate(names) if std > 0.0 and name not in (AIR, ground))
     nuclides = detectors[0].nuclide_names
     chosen = [knowledge.nuclides == "unknown" or name in knowledge.nuclides for name in nuclides]
-    model = knowledge.model_std if knowledge.site in ("exact", "geometry") else max(knowledge.model_std, BLIND_STD)
+    model = max(knowledge.model_std, BLIND_STD) if blind else knowledge.model_std
     return Presumed(
         site=known,
         detectors=tuple(coarse(d, LINES, names) for d in detectors),
@@ -171,12 +173,12 @@ def presume(
         background_std=on_host(knowledge.background_std),
         model_std=on_host(model),
         spectrum_std=on_host(knowledge.spectrum_std),
-        learning_rate=on_host(knowledge.learning_rate),
+        learning_rate=on_host(knowledge.learning_rate * (BLIND_SHARE if blind else 1.0)),
         log_activity=on_host(np.log(1e6 * knowledge.activity_mbq)),
         log_activity_std=on_host(np.log(knowledge.activity_factor)),
         pose_std_m=on_host(knowledge.pose_std_m),
         place_std_m=on_host(np.hypot(knowledge.pose_std_m, 0.0 if exact else knowledge.geometry_std_m)),
-        sensitivity_std=on_host(knowledge.sensitivity_std),
+        common_std=on_host(np.hypot(knowledge.sensitivity_std, BLIND_STD if blind else 0.0)),
         ground_share=on_host(ground_share),
         nuclides=on_host(chosen, bool),
         places=places_of(known, areas_m, spec.grid_m, spec.presumed_height_m),
@@ -314,7 +316,7 @@ def nothing_found(
         highest_cps=jnp.zeros(len(presumed.detectors)),
         windows=jnp.int32(0),
         noticed_bq=jnp.zeros(np.shape(presumed.nuclides)),
-        excluded=zero,
+        unsought=zero,
         state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
     )
 
@@ -352,7 +354,7 @@ def _report(
     covariance = covariance + jnp.where(sound[:, None, None], more, nothing_told)
     # those that were taken away may be a part of it, or it a part of them
     shared_ = jnp.minimum(s.beside_bq / jnp.maximum(s.activity_bq, 1.0), 1.0)
-    log_variance = covariance[:, 3, 3] + jnp.square(presumed.sensitivity_std) + jnp.square(shared_)
+    log_variance = covariance[:, 3, 3] + jnp.square(presumed.common_std) + jnp.square(shared_)
     height = jax.vmap(lambda xy: sample(site.terrain_m, site, xy))(mean[:, :2])
     activity = jnp.exp(mean[:, 3])
 
@@ -376,7 +378,7 @@ def _report(
     )
     strained, usual = strain(problem, state)
     rate = jnp.sum(true_counts(problem, state.added, state.unknowns), axis=1) / jnp.maximum(m.exposure_s, 1e-9)
-    limits_bq, excluded = for_those(
+    limits_bq, unsought = for_those(
         jnp.asarray(limits),
         lambda: noticed(problem, presumed.places, presumed.nuclides, params.search, state),
         lambda: (jnp.full(jnp.shape(presumed.nuclides), jnp.inf), jnp.zeros(())),
@@ -395,6 +397,6 @@ def _report(
         highest_cps=jnp.max(jnp.where(m.valid, rate, 0.0)[:, None] * problem.detector, axis=0),
         windows=jnp.sum(m.valid),
         noticed_bq=limits_bq,
-        excluded=excluded,
+        unsought=unsought,
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

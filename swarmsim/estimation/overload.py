@@ -30,9 +30,14 @@ def prominent(problem: Problem, own: jax.Array, others: Others) -> jax.Array:
     Where counters were overloaded it has to add `LEAST_SHARE` of all others in some window: by less the dead time, and
     the rate within a window, may be other than modelled.
     """
+    return least_prominent(problem, jnp.sum(own, axis=1), others) < 1.0
+
+
+def least_prominent(problem: Problem, own: jax.Array, others: Others) -> jax.Array:
+    """Activity [...] in Bq from which on a source that adds [..., n] per Bq is `prominent`, before dead time."""
     valid, rest = problem.measurements.valid, jnp.sum(others.counts, axis=(0, 2))
-    share = jnp.where(valid, jnp.sum(own, axis=1) / jnp.maximum(rest, MEAN_FLOOR), 0.0)
-    return ~overloaded(problem) | (jnp.max(share) > LEAST_SHARE)
+    share = jnp.max(jnp.where(valid, own / jnp.maximum(rest, MEAN_FLOOR), 0.0), axis=-1)
+    return jnp.where(overloaded(problem), LEAST_SHARE / jnp.maximum(share, 1e-30), 0.0)
 
 
 def likeliest(

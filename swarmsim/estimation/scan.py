@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.device import each
-from swarmsim.estimation.forward import Problem, padded, silent, with_one_ray
+from swarmsim.estimation.forward import Problem, left, padded, silent, with_one_ray
 from swarmsim.estimation.nodes import inverse_square_gain
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, linearised, normal_equations, of_window
 from swarmsim.pytree import on_device, pytree
@@ -76,7 +76,8 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     kernel = jnp.stack(kernels)  # [D, N, J, R]
     true = jnp.sum(true_counts(problem, others, u), axis=1)
     scale = m.exposure_s * jnp.sum(mean, axis=1) / jnp.maximum(true, 1e-9)  # [n]
-    shape = scale[:, None, None, None] * jnp.einsum("nd,dcjr->ncjr", models, kernel)  # [n, N, J, R]
+    there = left(problem, jnp.arange(allowed.shape[0])).T  # [n, N]
+    shape = (scale[:, None] * there)[:, :, None, None] * jnp.einsum("nd,dcjr->ncjr", models, kernel)  # [n, N, J, R]
 
     # what is common to all windows: the others' factors and the levels
     k, d = u.others.shape[0], u.level.shape[0]
@@ -92,9 +93,9 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
 
     # the fit's own deviations have taken up their part already: only what still pushes them is eliminated
     still = jnp.einsum("nab,nb->na", own_inverse, own_push)
-    left = weight * (m.rois - mean - jnp.einsum("nra,na->nr", of_own, still))  # [n, R]
+    rest = weight * (m.rois - mean - jnp.einsum("nra,na->nr", of_own, still))  # [n, R]
     across = eliminated(common)  # [n, R, Q]
-    pushes = jnp.einsum("ncjr,nr->ncj", shape, left)
+    pushes = jnp.einsum("ncjr,nr->ncj", shape, rest)
     crossings = jnp.einsum("ncjr,nrq->ncjq", shape, across)
     inner = jnp.einsum("nra,nr,ncjr->ncja", of_own, weight, shape)
     own = jnp.einsum("ncjr,nr,ncir->ncji", shape, weight, shape)
@@ -114,7 +115,7 @@ def scan(problem: Problem, points_m: jax.Array, allowed: jax.Array, others: Othe
     half = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(of_common), jnp.eye(k + d))
     information = information - jnp.einsum("ncp,pq,ncq->nc", cross, half, cross)
     information = jnp.maximum(information, 1e-30)
-    score = score - jnp.einsum("ncp,pq,q->nc", cross, half, jnp.einsum("nrp,nr->p", common, left))
+    score = score - jnp.einsum("ncp,pq,q->nc", cross, half, jnp.einsum("nrp,nr->p", common, rest))
     statistic = jnp.where(allowed, jnp.square(jnp.maximum(score, 0.0)) / information, -1.0)
     best = jnp.argmax(statistic, axis=1)
     chosen = best[:, None]
@@ -139,7 +140,8 @@ def open_totals(problem: Problem, points_m: jax.Array, nuclide: jax.Array) -> ja
     of_detector = jnp.stack(sums)[:, nuclide]  # [D, C, J]
     phi = _weights(points_m, m.position_m, m.valid)
     parts = (of_detector[d].T[:, :, None] * problem.detector[:, d] for d in range(len(sums)))  # each [J, C, n]
-    return m.exposure_s * sum((jnp.sum(phi * part, axis=0) for part in parts), jnp.zeros((count, m.valid.shape[0])))
+    rates = sum((jnp.sum(phi * part, axis=0) for part in parts), jnp.zeros((count, m.valid.shape[0])))
+    return m.exposure_s * left(problem, nuclide) * rates
 
 
 def _air_of(detector: Detector) -> int:
@@ -164,7 +166,7 @@ def open_counts(problem: Problem, point_m: jax.Array, nuclide: jax.Array) -> jax
             detector, source, way, nodes.position_m[own], nodes.axis[own], weight=gain[own]
         ).rates  # fmt: skip
         parts.append(padded(rates, problem.background.shape[1]))
-    return jnp.concatenate(parts) * problem.measurements.exposure_s[:, None]
+    return jnp.concatenate(parts) * (problem.measurements.exposure_s * left(problem, nuclide))[:, None]
 
 
 def true_counts(problem: Problem, others: Others, u: Unknowns) -> jax.Array:

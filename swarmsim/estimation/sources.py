@@ -94,7 +94,21 @@ def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: S
         p = replace(p, state=state, trial=p.trial & ~spent, over=p.over | full | spent)
         return _joined(problem, _divided(problem, params, p))
 
-    return repeat_while(lambda p: ~p.over, step, start, IN_STEP).state
+    return _believed(problem, params, repeat_while(lambda p: ~p.over, step, start, IN_STEP).state)
+
+
+def _believed(problem: Problem, params: SearchParams, state: State) -> State:
+    """The state, without its only source where that explains less than is asked of one.
+
+    An earlier estimate may have had it from counts to which later ones say otherwise.
+    """
+
+    def judged() -> State:
+        k = jnp.argmax(state.sources.present)
+        none = settled(problem, without(state, k))
+        return jax.tree.map(partial(jnp.where, ratios(problem, state)[k] < params.threshold), none, state)
+
+    return for_those(jnp.sum(state.sources.present) == 1, judged, lambda: state)
 
 
 def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:

@@ -75,8 +75,17 @@ def places_of(site: Site, areas_m: Sequence[np.ndarray], step_m: float, height_m
         inside_m=on_host(inside),
         near=on_host(near, np.int32),
         there=on_host(there, bool),
-        surveyed=on_host(in_areas(xy, areas_m), bool),
+        surveyed=on_host(_surveyed(xy, areas_m), bool),
     )
+
+
+def _surveyed(xy: np.ndarray, areas_m: Sequence[np.ndarray]) -> np.ndarray:
+    """Which points [C, 2] lie in areas; of one narrower than the grid that is nearest to its middle."""
+    inside = in_areas(xy, areas_m)
+    for area in areas_m:
+        if not np.any(in_areas(xy, [area])):
+            inside[np.argmin(np.linalg.norm(xy - np.mean(area, axis=0), axis=1))] = True
+    return inside
 
 
 def _inside(site: Site, low: np.ndarray, high: np.ndarray, step_m: float) -> np.ndarray:

@@ -211,7 +211,7 @@ def accumulate_spectrum(
     # an idealised counter draws counts that stand for one second, whatever its period is
     per_exposure = detector.sample_period_s if detector.kind == "paper_ideal" else jnp.ones(())
     live = jnp.where(used, samples.exposure_s * per_exposure, 0.0)
-    begin_s = jnp.min(jnp.where(used, samples.time_s - samples.exposure_s, jnp.inf))
+    begin_s = jnp.min(jnp.where(used, samples.time_s - live, jnp.inf))
     expected = expected_spectrum(key, world, model, trail)
 
     def add(total: jax.Array, sample: tuple[jax.Array, ...]) -> tuple[jax.Array, None]:

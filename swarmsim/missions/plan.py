@@ -1,6 +1,6 @@
 """A mission as data: its phases with their policies, and what the mission knows and presumes."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -154,3 +154,12 @@ class Plan:
     def asks(self) -> bool:
         """Whether a phase asks for the source."""
         return any(phase.target == "source" for phase in self.phases)
+
+    def asked(self, phases: Sequence[Any]) -> Any:
+        """Whether [...] one of the phases that ask for the source has begun, by their states."""
+        asked = [
+            np.isfinite(np.asarray(state.asked_s))
+            for phase, state in zip(self.phases, phases, strict=True)
+            if phase.target == "source"
+        ]
+        return np.any(asked, axis=0)

@@ -69,6 +69,7 @@ class Detector:
     paralyzable_s: jax.Array  # []
     non_paralyzable_s: jax.Array  # []
     sample_period_s: jax.Array  # [] real time of one measurement, dead time included
+    decay_1_s: jax.Array  # [N] decay constant
     yields: jax.Array  # [N, L] photons per decay
     effective_area_m2: jax.Array  # [N, L, 5] coefficients of cylinder.direction_basis, housing and threshold included
     near: jax.Array  # [NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS] of cylinder.near_parts
@@ -148,6 +149,7 @@ def build_detector(spec: DetectorSpec, mount: DetectorMount, library: Library, k
         paralyzable_s=f32(spec.dead_time.paralyzable_us * 1e-6),
         non_paralyzable_s=f32(spec.dead_time.non_paralyzable_us * 1e-6),
         sample_period_s=f32(spec.sample_period_s),
+        decay_1_s=f32(library.decay_1_s),
         yields=f32(yields),
         effective_area_m2=f32(area),
         near=f32(near),
@@ -186,7 +188,8 @@ def restrict(detector: Detector, nuclides: tuple[str, ...]) -> Detector:
     tables = {name: getattr(detector, name)[rows, :lines] for name in second}
     tables |= {name: getattr(detector, name)[rows][..., :lines, :] for name in last_but_one}
     stranger = np.array([name not in nuclides for name in detector.known_names], np.float32)
-    return replace(detector, nuclide_names=nuclides, stranger=on_device(stranger), **tables)
+    tables |= {"decay_1_s": detector.decay_1_s[rows], "stranger": on_device(stranger)}
+    return replace(detector, nuclide_names=nuclides, **tables)
 
 
 def lines_of(library: Library) -> tuple[Floats, Floats]:

@@ -69,6 +69,7 @@ def build_dosimeter(library: Library, quantity: Quantity = "ambient_dose_equival
         paralyzable_s=zero,
         non_paralyzable_s=zero,
         sample_period_s=f32(1.0),
+        decay_1_s=f32(library.decay_1_s),
         yields=f32(yields),
         effective_area_m2=f32(area),
         near=f32(np.zeros((NEAR_TABLES, NEAR_ROWS, NEAR_COLUMNS))),

@@ -27,7 +27,11 @@ LOWEST_KEV, HIGHEST_KEV = 60.0, 2700.0
 """Energies for which the operator is made; a detector's channels may end before."""
 _ENERGIES = 48
 _EVEN = np.array([1.0, 1 / 2, np.pi / 4, 1 / 3, 1 / 3])  # mean over all directions of cylinder.direction_basis
-_LEAST_SHARE = 1e-3  # of a saturated non-paralyzable detector
+_LEAST_SHARE = 0.05
+"""Of the counts that are registered, and of the change of what is shown with the true rate, in a saturated detector.
+
+Beyond, chance decides: a non-paralyzable detector that shows 95 % of its highest rate may be at any rate from there on.
+"""
 _NODES = 4096  # of the inverse of the dead time law
 
 
@@ -37,7 +41,7 @@ class DoseRates:
 
     live_s: Floats  # [n] part of the exposure in which the detector was not dead, by its dead time law
     ambient_usv_h: Floats  # [n] ambient dose equivalent rate H*(10)
-    ambient_std_usv_h: Floats  # [n] standard deviation by counting statistics alone
+    ambient_std_usv_h: Floats  # [n] standard deviation by counting statistics, which dead time enlarges
     kerma_ugy_h: Floats  # [n] air kerma rate
 
 
@@ -59,11 +63,15 @@ class DoseOperator:
         The standard deviation of no count at all is that of one.
         """
         total = np.asarray(counts, float).sum(axis=1)
-        live = exposure_s * self._live_share(total / exposure_s)
-        variance = counts @ self.ambient**2 + np.where(total > 0.0, 0.0, np.mean(self.ambient**2))
+        share = self._live_share(total / exposure_s)
+        live, dose = exposure_s * share, counts @ self.ambient
+        # all windows have in common what the dead time makes of a chance excess of all counts
+        stretched = self._stretch(total / exposure_s, share) ** 2 - 1.0
+        variance = counts @ self.ambient**2 + stretched * dose**2 / np.maximum(total, 1.0)
+        variance += np.where(total > 0.0, 0.0, np.mean(self.ambient**2))
         return DoseRates(
             live_s=live,
-            ambient_usv_h=counts @ self.ambient / live,
+            ambient_usv_h=dose / live,
             ambient_std_usv_h=np.sqrt(variance) / live,
             kerma_ugy_h=counts @ self.kerma / live,
         )
@@ -76,6 +84,12 @@ class DoseOperator:
         true = saturating_rate(paralyzable, non_paralyzable) * np.linspace(0.0, 1.0, _NODES) ** 2
         registered = shown(true, paralyzable, non_paralyzable)
         return np.interp(observed_cps, registered, np.concatenate([[1.0], registered[1:] / true[1:]]))
+
+    def _stretch(self, observed_cps: Floats, share: Floats) -> Floats:
+        """Relative change [n] of the true rate over that of what is registered, by the law of `registered_share`."""
+        true = observed_cps / share
+        dead = true * self.paralyzable_s + true * self.non_paralyzable_s / (1.0 + true * self.non_paralyzable_s)
+        return np.asarray(1.0 / np.maximum(1.0 - dead, _LEAST_SHARE))
 
 
 def dose_operator(spec: DetectorSpec, library: Library, kind: str) -> DoseOperator:

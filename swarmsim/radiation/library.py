@@ -1,5 +1,6 @@
 """The nuclides and materials of the configuration folders (host side)."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -29,6 +30,11 @@ class Library:
     def material_names(self) -> tuple[str, ...]:
         """Sorted names of the materials."""
         return tuple(m.name for m in self.materials)
+
+    @property
+    def decay_1_s(self) -> tuple[float, ...]:
+        """Decay constant of each nuclide."""
+        return tuple(math.log(2.0) / n.half_life_s for n in self.nuclides)
 
     def nuclide(self, name: str) -> Nuclide:
         """The nuclide of that name; raises `InputError` with the nearest one."""

@@ -188,11 +188,14 @@ def shown(rate_cps: Floats | float, paralyzable_s: float, non_paralyzable_s: flo
 
 def highest_rate(detector: Detector) -> float:
     """Largest rate that the detector can show; inf without dead time (host)."""
-    paralyzable, non_paralyzable = float(detector.paralyzable_s), float(detector.non_paralyzable_s)
-    if paralyzable <= 0.0:
-        return np.inf if non_paralyzable <= 0.0 else 1.0 / non_paralyzable
-    n = saturating_rate(paralyzable, non_paralyzable)
-    return float(shown(n, paralyzable, non_paralyzable))
+    return most_shown(float(detector.paralyzable_s), float(detector.non_paralyzable_s))
+
+
+def most_shown(paralyzable_s: float, non_paralyzable_s: float) -> float:
+    """`highest_rate` of a detector with these dead times."""
+    if paralyzable_s <= 0.0:
+        return np.inf if non_paralyzable_s <= 0.0 else 1.0 / non_paralyzable_s
+    return float(shown(saturating_rate(paralyzable_s, non_paralyzable_s), paralyzable_s, non_paralyzable_s))
 
 
 def saturating_rate(paralyzable_s: float, non_paralyzable_s: float) -> float:

@@ -9,11 +9,12 @@ from swarmsim.estimation import Estimated
 from swarmsim.missions.plan_build import mapped_areas
 from swarmsim.missions.state import MissionState
 from swarmsim.radiation.identify import NONE, UNKNOWN
-from swarmsim.radiation.rate import highest_rate, rate_showing
+from swarmsim.radiation.rate import rate_showing
 from swarmsim.results.finding import NO_SPECTRUM, NO_WAY, finding
 from swarmsim.results.record import Estimate, Event, RadiationMap, Samples, Spectrum
+from swarmsim.results.saturation import SATURATED_SHARE
 from swarmsim.results.sources import gamma_constants
-from swarmsim.results.status import SATURATED_SHARE, Fit, Verdict, assess, source_of_spectrum
+from swarmsim.results.status import Fit, Verdict, assess, source_of_spectrum
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.site.model import height_at
 from swarmsim.world.build import detector_models
@@ -37,6 +38,7 @@ class Answer:
     map: RadiationMap | None = None
     spectrum: Spectrum | None = None
     noticed_mbq: dict[str, float] = field(default_factory=dict)  # see `MissionRecord`
+    examined: int | None = None  # likewise
 
 
 def answer_of(
@@ -59,7 +61,7 @@ def answer_of(
         surveyed, final = (tuple(replace(one, errors_known=False) for one in several) for several in (surveyed, final))
         noticed = {}  # a paralysed counter notices nothing
     said = finding(verdict, final, telling, hindrance, one_nuclide, examined or 0, noticed)
-    return Answer(said, verdict, surveyed, final, chart, spectrum, noticed)
+    return Answer(said, verdict, surveyed, final, chart, spectrum, noticed, examined)
 
 
 def _map(simulation: Simulation, survey: Any) -> RadiationMap:
@@ -126,6 +128,7 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
         live_time_s=live,
         nuclide=names[index] if index >= 0 else UNNAMED[index],
         confidence=float(answer.confidence),
+        sure=float(answer.confidence) >= float(simulation.plan.confidence_min),
         unknown=float(answer.unknown),
         goodness=float(answer.goodness),
         scores=dict(zip(names, map(float, answer.posterior), strict=True)),
@@ -179,32 +182,27 @@ def _verdict(
     """Status of the mission's answer."""
     estimated, detectors, presumed = conclusion.estimated, simulation.plan.detectors, simulation.plan.presumed
     assert presumed is not None
-    used = np.full(len(simulation.scenario.members), -1)
-    for group in simulation.world.groups:
-        if group.counter is not None:
-            used[list(group.member)] = group.counter.index
-    of_vehicle = used[samples.vehicle]
-    highest = np.array([highest_rate(detector) for detector in detectors])
-    background = np.array([float(detector.background_cps) for detector in detectors])
+    assert simulation.plan.localisation is not None
     suggested = ""
     if spectrum is not None and spectrum.nuclide != UNNAMED[NONE] and not _no_way(simulation, end):
-        suggested = spectrum.nuclide if spectrum.confidence >= float(simulation.plan.confidence_min) else ""
+        suggested = spectrum.nuclide if spectrum.sure else ""
     doubtful = np.array([rate_showing(detector, SATURATED_SHARE) for detector in detectors])
     fit = Fit(
         misfit=float(estimated.misfit),
         chi_squared=float(estimated.chi_squared),
         strain=float(estimated.strain),
-        excluded=float(estimated.excluded),
+        unsought=float(estimated.unsought),
+        full=len(final) == simulation.plan.localisation.search.sources_max,
         load=float(np.max(np.asarray(estimated.highest_cps) / doubtful, initial=0.0)),
     )
     site = simulation.site_model.site
     ground = height_at(site, np.asarray(samples.position_m, float)[:, :2])
-    below = height_at(site, np.array([one.position_m[:2] for one in final]).reshape(-1, 2))
+    # the true ground is not known to every mission
+    below = height_at(presumed.site, np.array([one.position_m[:2] for one in final]).reshape(-1, 2))
     height_m, height_std_m = float(presumed.height_m), float(presumed.height_std_m) or np.inf  # 0: it is held
     return assess(
         samples,
         chart,
-        (highest[of_vehicle], background[of_vehicle]),
         ground,
         fit,
         aerial,

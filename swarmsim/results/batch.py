@@ -57,7 +57,7 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     # of the nuclide in question that is noticed first, and of the one that is last; None where it never is
     limits = [value if np.isfinite(value) else None for value in sorted(record.noticed_mbq.values())]
     row |= {"noticed_least_mbq": next(iter(limits), None), "noticed_most_mbq": next(reversed(limits), None)}
-    row["nuclide"] = named(record.spectrum)
+    row["nuclide"] = named(record)
     row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
     dose = dose_summary(record)
     row["dose_rate_greatest_usv_h"] = None if dose is None else dose["greatest_usv_h"]

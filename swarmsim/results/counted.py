@@ -110,6 +110,7 @@ def _samples(table: pa.Table, windows: tuple[Window, ...]) -> Samples:
         axis=np.stack([column(f"axis_{axis}") for axis in AXES], axis=1),
         windows=np.stack(by_window, axis=1) if by_window else np.zeros((table.num_rows, 0)),
         **{name: column(name) for name in DOSES},
+        saturated=None if "saturated" not in table.column_names else column("saturated") > 0.5,
     )
 
 
@@ -127,4 +128,5 @@ def _spectrum(table: pa.Table) -> Spectrum:
         scores={},
         detector=metadata["detector"],
         begin_s=float(metadata.get("begin_s", 0.0)),
+        sure=metadata.get("sure", "True") == "True",
     )

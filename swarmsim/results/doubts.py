@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ WEAK_DETECTION = 200.0
 The false ones 10 to 15 m from sources in barns had 76 and 80; 61 is asked of any (`localisation.further_sigma`).
 """
 CONFIRMED = 0.9  # probability in the spectrum taken near it, above which a nuclide of several in one place is believed
+BESIDE_M = 15.0  # between sources that one spectrum may show
 UNUSUAL_SIGMA = 2.5  # between the height of a source and what is presumed of it
 IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed of it
 
@@ -30,8 +32,16 @@ def in_mbq(activity_mbq: float) -> str:
     return f"{activity_mbq:.0f} MBq" if activity_mbq >= 10.0 else f"{activity_mbq:.2g} MBq"
 
 
-def companions(final: Sequence[Estimate], strength: Sequence[float]) -> list[tuple[Status, str]]:
-    """Faint sources beside a strong one of the same nuclide, or any two at one place: errors of the model of walls."""
+def companions(
+    final: Sequence[Estimate],
+    strength: Sequence[float],
+    examined: Estimate | None = None,
+    identified: Mapping[str, float] = MappingProxyType({}),
+) -> list[tuple[Status, str]]:
+    """Faint sources beside a strong one of the same nuclide, or any two at one place: errors of the model of walls.
+
+    ``strength`` is the dose rate of each. Different nuclides that the spectrum shows both are no error.
+    """
     found: list[tuple[Status, str]] = []
     for pair in itertools.combinations(zip(final, strength, strict=True), 2):
         (faint, less), (strong, more) = sorted(pair, key=lambda one: one[1])
@@ -44,8 +54,8 @@ def companions(final: Sequence[Estimate], strength: Sequence[float]) -> list[tup
         # what the model does not explain about a source is taken up by others near it, of any nuclide
         several = max(strong.joined_m, faint.joined_m) > 0.0 and apart < COMPANION_M
         taken_up = several or (share < FAINT_SHARE and apart < FAINT_M)
-        if alike or taken_up:
-            other = "a stronger one" if share < 1.0 else "another one"
+        if alike or (taken_up and not _shown((faint, strong), examined, identified)):
+            other = "one of a higher dose rate" if share < 1.0 else "another one"
             text = f"the {faint.nuclide} source of {in_mbq(faint.activity_mbq)} {apart:.2g} m beside {other}"
             found.append(("ambiguous", f"{text} may be an error of the model"))
     return found
@@ -58,22 +68,33 @@ def mixed(
     found: list[tuple[Status, str]] = []
     for one, other in itertools.combinations(final, 2):
         apart, names = apart_m(one, other), (one.nuclide, other.nuclide)
-        shown = any(x is examined for x in (one, other)) and all(
-            identified.get(name, 0.0) > CONFIRMED for name in names
-        )
-        if names[0] != names[1] and apart < ONE_M and not shown:
+        if names[0] != names[1] and apart < ONE_M and not _shown((one, other), examined, identified):
             text = f"the {names[0]} and {names[1]} sources {apart:.2g} m apart may be one of another nuclide"
             found.append(("ambiguous", text))
     return found
 
 
-def contradicted(examined: Estimate | None, suggested: str) -> list[tuple[Status, str]]:
+def _shown(pair: Sequence[Estimate], examined: Estimate | None, identified: Mapping[str, float]) -> bool:
+    """Whether the spectrum taken near one of two sources of different nuclides shows both."""
+    one, other = pair
+    both = all(identified.get(each.nuclide, 0.0) > CONFIRMED for each in pair)
+    return one.nuclide != other.nuclide and (one is examined or other is examined) and both
+
+
+def contradicted(
+    final: Sequence[Estimate], examined: Estimate | None, suggested: str, identified: Mapping[str, float]
+) -> list[tuple[Status, str]]:
     """A spectrum of another nuclide than that under which the source was sought near which it was taken.
+
+    Unless it shows that one as well, and the other is that of a source beside it.
 
     None of 222 located missions of `random_recon` had one; before, a weak source beside a strong one 4 standard
     deviations from its place did.
     """
     if examined is None or suggested in ("", examined.nuclide):
+        return []
+    near = [one for one in final if one.nuclide == suggested and apart_m(one, examined) < BESIDE_M]
+    if any(_shown((one, examined), examined, identified) for one in near):
         return []
     other = "none in the library" if suggested == "unknown" else suggested
     return [("ambiguous", f"the spectrum taken near the {examined.nuclide} source is of {other}")]
@@ -87,7 +108,7 @@ def unsure_nuclides(final: Sequence[Estimate], examined: Estimate | None, sugges
     return [
         (
             "ambiguous",
-            f"the {one.nuclide} source may be of another nuclide ({one.nuclide_confidence:.0%} by the counts)",
+            f"the {one.nuclide} source may be of another nuclide ({one.nuclide_confidence:.1%} by the counts)",
         )
         for one in final
         if one.nuclide_confidence < CONFIRMED and not (one is examined and suggested == one.nuclide)

@@ -66,6 +66,7 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
         covered=None if verdict is None else verdict.covered,
         warnings=(*((CROWDED,) if bool(end.world.crowded) else ()), *survey_doubts(surveyed, final)),
         noticed_mbq=answer.noticed_mbq,
+        examined=answer.examined,
         drawn=batch.draws.told(index),
         windows_kev=windows_of(simulation),
         at_1_m=gamma_constants(simulation, (*surveyed, *final, *sources)),

@@ -131,7 +131,7 @@ def _identified(estimate: Estimate, spectrum: Spectrum, by: str) -> str:
         alike = f", most like {spectrum.alike}" if spectrum.alike else ""
         return f"{by}, the spectrum is of none in the library with {spectrum.confidence:.0%}{alike}"
     said = f"identified with {'more than 99.9%' if spectrum.confidence > 0.999 else f'{spectrum.confidence:.1%}'}"
-    if spectrum.nuclide != estimate.nuclide:
+    if spectrum.nuclide != estimate.nuclide or not spectrum.sure:
         said = f"{by}, the spectrum suggests {spectrum.nuclide} with {spectrum.confidence:.0%}"
     if spectrum.goodness < BAD_FIT:
         said += f", but fits the spectrum badly (p = {spectrum.goodness:.1g})"

@@ -199,4 +199,4 @@ def _write_spectrum(simulation: Simulation, counted: Counted, spectrum: Spectrum
         n42.write(
             file, [n42.measurement("RadMeasurement", "background", "Background", begin, live, natural, "Expected.")]
         )
-        n42.write(file, [n42.nuclide("near", spectrum.nuclide, float(spectrum.confidence))])
+        n42.write(file, [n42.nuclide("near", spectrum.nuclide, float(spectrum.confidence), spectrum.sure)])

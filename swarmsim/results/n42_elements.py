@@ -224,17 +224,21 @@ def measurement(
     )
 
 
-def nuclide(measured: str, name: str, confidence: float) -> Element:
-    """What was identified in the measurement ``measured``: a nuclide, "none" or "unknown", each with a confidence."""
+def nuclide(measured: str, name: str, confidence: float, sure: bool) -> Element:
+    """What was identified in the measurement ``measured``: a nuclide, "none" or "unknown", each with a confidence.
+
+    Unless that is ``sure`` the nuclide is suggested and not identified.
+    """
     percent = f"{100.0 * confidence:.4g}"
     found = element(
         "Nuclide",
-        element("NuclideIdentifiedIndicator", "true"),
+        element("NuclideIdentifiedIndicator", "true" if sure else "false"),
         element("NuclideName", name),
         element("NuclideIDConfidenceValue", percent),
     )
     named = name not in ("none", "unknown")
-    told = f"The spectrum is that of {name}." if named else f"Nuclide: {name}."
+    verb = "is that of" if sure else "suggests"
+    told = f"The spectrum {verb} {name}." if named else f"Nuclide: {name}."
     return element(
         "AnalysisResults",
         element("AnalysisResultStatusCode", "Success"),

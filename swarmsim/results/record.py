@@ -78,6 +78,7 @@ class Samples:
     dose_rate_usv_h: Floats | None = None  # [n] H*(10) by the counts (`DoseOperator`), natural background included
     dose_rate_std_usv_h: Floats | None = None  # [n] its standard deviation by counting statistics
     kerma_rate_ugy_h: Floats | None = None  # [n] air kerma rate by the counts
+    saturated: NDArray[np.bool_] | None = None  # [n] the counter was in its dead time (`swarmsim.results.saturation`)
 
     def rows(self, index: NDArray[Any] | slice) -> "Samples":
         """Those that ``index`` chooses, in its order."""
@@ -143,6 +144,7 @@ class Spectrum:
     goodness: float = 1.0  # p-value of the deviance of the fit
     detector: str = ""  # model that took it
     begin_s: float = 0.0  # when its first sample began
+    sure: bool = True  # the confidence is what the mission asks for (`identification.confidence_min`)
     alike: str = ""  # the nuclide outside the library that an unknown source most likely is, if likelier than not
 
 
@@ -230,6 +232,7 @@ class MissionRecord:
     """Activity by nuclide in question from which on a source in free view, beside those found, would have been noticed
     with 95 %, at 95 % of the survey area (a detection limit, ISO 11929); infinite where none would.
     """
+    examined: int | None = None  # number of the one of ``estimates`` that the spectrum was taken near; None: of none
     drawn: Mapping[str, Any] = field(default_factory=dict)  # what the mission of a family drew, by path
     windows_kev: tuple[Window, ...] = ()  # energy windows of all detectors, lowest first
     at_1_m: Mapping[str, GammaConstant] = field(default_factory=dict)  # by nuclide, of those found and the true ones

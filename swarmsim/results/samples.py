@@ -8,7 +8,9 @@ import numpy as np
 from swarmsim.kept import kept
 from swarmsim.radiation.dose_operator import DoseOperator, dose_operator
 from swarmsim.radiation.library import Library
+from swarmsim.radiation.rate import most_shown
 from swarmsim.results.record import Phase, Samples, Window
+from swarmsim.results.saturation import saturated
 from swarmsim.runtime.simulation import Simulation
 from swarmsim.world.model import Group
 
@@ -46,7 +48,12 @@ def measured_rows(simulation: Simulation, group: Group, rows: Mapping[str, np.nd
     by_window = np.full((len(counts), len(windows)), np.nan)
     own = list(pairwise(operator.edges_kev))
     by_window[:, [windows.index(window) for window in own]] = counts[:, : len(own)]
+    mount = simulation.scenario.vehicles[int(np.asarray(group.member)[0])].detector
+    assert mount is not None
+    background = simulation.scenario.detectors[mount.model].background.rate_cps
     return {name: rows[name] for name in (*SAMPLE, "vehicle")} | {
+        "highest_cps": np.full(len(counts), most_shown(operator.paralyzable_s, operator.non_paralyzable_s)),
+        "quiet_cps": np.full(len(counts), background if operator.paralyzable_s > 0.0 else 0.0),
         "windows": by_window,
         "live_s": rates.live_s,
         "dose_rate_usv_h": rates.ambient_usv_h,
@@ -63,9 +70,12 @@ def samples_of(found: Sequence[Mapping[str, np.ndarray]], phases: Sequence[Phase
     joined = {name: np.concatenate([rows[name] for rows in found]) for name in found[0]}
     order = np.argsort(joined["time_s"], kind="stable")
     rows = {name: values[order] for name, values in joined.items()}
+    highest, quiet = rows.pop("highest_cps"), rows.pop("quiet_cps")
+    exposure_s = np.asarray(rows["exposure_s"], float)
     return Samples(
         phase=_phase_names(rows["vehicle"], rows["time_s"], phases),
         count_rate_cps=rows["counts"] / rows["exposure_s"],
+        saturated=saturated(rows["vehicle"], np.asarray(rows["counts"], float), exposure_s, highest, quiet),
         **rows,
     )
 

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from swarmsim.estimation.pairs import COMPANION_M
 from swarmsim.results.doubts import (
+    CONFIRMED,
     Status,
     apart_m,
     companions,
@@ -28,11 +29,10 @@ Floats = NDArray[np.floating]
 CERTAIN: tuple[Status, ...] = ("located", "none", "not_sought")
 """Statuses that stand for an answer; with the others ``swarmsim run --strict`` ends with 3."""
 
-SATURATED_SHARE = 0.75  # of the highest rate that a counter can show: a paralysable one loses a third of the pulses
-PARALYSED_SHARE = 0.1  # of the nominal background: a counter that shows less is paralysed or broken
 COVERED_SHARE = 0.8  # of the survey area must have been measured
 REACH_HEIGHTS = 1.0  # a measurement covers the ground around it up to its own height, at least `REACH_M`
 REACH_M = 8.0
+AT_ONCE = 1024  # measurements whose cells are looked up together
 FAR_STD_M = 10.0  # a source known no better is detected, not located
 MISFIT_SIGMA, MISFIT_LEAST = 6.0, 1.1  # a chi-squared above both contradicts the model
 STRAINED = 350.0
@@ -44,6 +44,7 @@ place of one 400 to 1300.
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 EXCLUDED = "the counts show a source of a nuclide that is not in question (knowledge.nuclides)"
+MORE = "the counts show more sources than are sought (localisation.sources_max)"
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
 UNEXPLAINED_SIGMA = 3.0  # of the background: a hotspot that exceeds it by less may be of the background
 
@@ -55,7 +56,8 @@ class Fit:
     misfit: float  # standard deviations by which chi-squared exceeds its degrees of freedom
     chi_squared: float  # over its degrees of freedom
     strain: float = 0.0  # what rates depart from the model by, beyond what is usual (`Estimated.strain`)
-    excluded: float = 0.0  # `Estimated.excluded`
+    unsought: float = 0.0  # `Estimated.unsought`
+    full: bool = False  # as many sources are found as are sought
     load: float = 0.0  # highest true rate of a counter by them, over that at which it shows `SATURATED_SHARE`
 
 
@@ -71,7 +73,6 @@ class Verdict:
 def assess(
     samples: Samples,
     chart: RadiationMap,
-    limits_cps: tuple[Floats, Floats],
     ground_m: Floats,
     fit: Fit,
     aerial: Sequence[Estimate],
@@ -91,7 +92,6 @@ def assess(
     Args:
         samples: all measurements.
         chart: the radiation map.
-        limits_cps: for each sample [n] the highest rate that its counter can show (inf: any), and its background.
         ground_m: height of the ground below each sample [n].
         fit: of all sources to all counts.
         aerial: sources by the survey's counts.
@@ -109,7 +109,7 @@ def assess(
     covered = coverage(samples, chart, ground_m, areas_m)
     reasons = []
     status: Status = "located" if final else "none"
-    if fit.load > 1.0 or _saturated(samples, limits_cps):
+    if fit.load > 1.0 or (samples.saturated is not None and np.any(samples.saturated)):
         status = "saturated"
         reasons.append("a counter was driven into its dead time, so rates and places close to the source are doubtful")
     if covered < COVERED_SHARE:
@@ -119,12 +119,13 @@ def assess(
         status = "incomplete_survey" if status == "none" else status
         reasons.append(f"one as presumed, of {in_mbq(activity[0])} (knowledge.activity_mbq), would have gone unnoticed")
     strength = [one.activity_mbq * at_1_m[one.nuclide].kerma_ugy_h if at_1_m else one.activity_mbq for one in final]
-    doubts = _doubts(chart, fit, aerial, final, strength, background_std, activity)
     examined = final[spectrum_of] if final else None
-    doubts += mixed(final, examined, identified) + contradicted(examined, suggested)
+    doubts = _doubts(chart, fit, aerial, final, background_std)
+    doubts += companions(final, strength, examined, identified) + implausible(final, *activity)
+    doubts += mixed(final, examined, identified) + contradicted(final, examined, suggested, identified)
     doubts += unsure_nuclides(final, examined, suggested) + unusual_heights(final, heights)
-    if not final and fit.excluded > 1.0:
-        doubts.append(("inconsistent", EXCLUDED))
+    if fit.unsought > 1.0 and (fit.full or not final):
+        doubts.append(("ambiguous", MORE) if fit.full else ("inconsistent", EXCLUDED))
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     if status == "saturated":  # no errors of places are stated
@@ -134,7 +135,7 @@ def assess(
 
 
 def coverage(samples: Samples, chart: RadiationMap, ground_m: Floats, areas_m: Sequence[Floats] = ()) -> float:
-    """Share of the map's cells with a measurement near them: within the measurement's height above ground.
+    """Share of the map's cells with a measurement near them: within its height above the ground, or `REACH_M`.
 
     Of the cells in ``areas_m`` where there are any.
     """
@@ -149,21 +150,12 @@ def coverage(samples: Samples, chart: RadiationMap, ground_m: Floats, areas_m: S
         return 0.0
     reach = np.maximum(REACH_HEIGHTS * (place[:, 2] - ground_m), REACH_M)
     seen = np.zeros(len(cells), bool)
-    for low in np.unique(np.floor(reach / 4.0) * 4.0):
-        chosen = (reach >= low) & (reach < low + 4.0)
-        distance, _ = cKDTree(place[chosen, :2]).query(cells, distance_upper_bound=max(low, REACH_M) + 1e-6)
-        seen |= np.isfinite(distance)
+    tree = cKDTree(cells)
+    for first in range(0, len(place), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        for near in tree.query_ball_point(place[part, :2], reach[part] + 1e-6):
+            seen[near] = True
     return float(seen.mean())
-
-
-def _saturated(samples: Samples, limits_cps: tuple[Floats, Floats]) -> bool:
-    highest, background = limits_cps
-    rate, counts = np.asarray(samples.count_rate_cps, float), np.asarray(samples.exposure_s, float) * background
-    if np.any(rate > SATURATED_SHARE * highest):
-        return True
-    # two seconds of background at least: a single silent sample is chance
-    silent = rate < PARALYSED_SHARE * background
-    return bool(counts[silent].sum() > 0.02 * counts.sum() + 50.0)
 
 
 def _doubts(
@@ -171,9 +163,7 @@ def _doubts(
     fit: Fit,
     aerial: Sequence[Estimate],
     final: Sequence[Estimate],
-    strength: Sequence[float],
     background_std: float,
-    activity: tuple[float, float],
 ) -> list[tuple[Status, str]]:
     """Reasons not to believe the answer, the gravest first."""
     found: list[tuple[Status, str]] = []
@@ -199,8 +189,6 @@ def _doubts(
         std = np.sqrt(np.maximum(np.linalg.eigvalsh(np.asarray(one.covariance_m2)[:2, :2])[-1], 0.0))
         if std > FAR_STD_M:
             found.append(("detected", f"the place of the {one.nuclide} source is known to {std:.0f} m only"))
-    found += companions(final, strength)
-    found += implausible(final, *activity)
     found += _unexplained(chart, final, background_std)
     return found
 
@@ -243,7 +231,7 @@ def survey_doubts(survey: Sequence[Estimate], sources: Sequence[Estimate]) -> tu
     told = []
     for before in survey:
         final = _of_all_counts(before, sources)
-        if final is None or _disagreement(before, survey, sources):
+        if not before.errors_known or final is None or _disagreement(before, survey, sources):
             continue
         if len(_beside(before, survey)) > 1 or len(_beside(final, sources)) > 1:
             continue
@@ -277,6 +265,8 @@ def _contradiction(first: Sequence[Estimate], last: Sequence[Estimate]) -> str:
     distance, sigmas = _off(first, last, MODEL_STD_M)
     if sigmas > APART_SIGMA:
         return f"the {last[0].nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
+    if first[0].nuclide != last[0].nuclide:
+        return ""
     totals = [sum(max(one.activity_mbq, 1e-9) for one in group) for group in (first, last)]
     stds = [max(one.activity_std_mbq for one in group) for group in (first, last)]
     ratio = np.log(totals[1] / totals[0])
@@ -287,8 +277,15 @@ def _contradiction(first: Sequence[Estimate], last: Sequence[Estimate]) -> str:
 
 
 def _of_all_counts(before: Estimate, sources: Sequence[Estimate]) -> Estimate | None:
-    """The nearest of the ``sources`` by all counts that is of the nuclide of one of the survey; None without any."""
-    alike = [one for one in sources if one.nuclide == before.nuclide]
+    """The nearest of the ``sources`` by all counts that may be of the nuclide of one of the survey; None without any.
+
+    Of any nuclide where the counts do not tell which one it is.
+    """
+    alike = [
+        one
+        for one in sources
+        if one.nuclide == before.nuclide or min(one.nuclide_confidence, before.nuclide_confidence) < CONFIRMED
+    ]
     return min(alike, key=lambda one: apart_m(one, before), default=None)
 
 

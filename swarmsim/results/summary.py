@@ -13,7 +13,6 @@ from swarmsim.results.record import (
     MissionRecord,
     Phase,
     RadiationMap,
-    Spectrum,
     TrueSource,
     VehicleRecord,
 )
@@ -71,8 +70,10 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
     Errors are distances to the nearest true source: of the hotspot on the map (horizontal), of the source in space. A
     line or an area counts by its centre of activity, a source on a vehicle by where it was at the start; activities are
     those of the start. ``noticed_mbq`` is the activity by nuclide from which on a source in free view, beside those
-    found, would have been noticed (`MissionRecord.noticed_mbq`; None: none would). ``departures`` is what was drawn for
-    the mission within its knowledge (`departures_summary`).
+    found, would have been noticed (`MissionRecord.noticed_mbq`; None: none would). ``nuclide`` is what the spectrum
+    names (None: nothing that the mission is sure enough of), taken near source number ``of_source`` (0: ``source``,
+    from 1 on ``further_sources``; None: near none of them). ``departures`` is what was drawn for the mission within its
+    knowledge (`departures_summary`).
     """
     record = record.finite()
     hotspot = hotspot_of(record.map)
@@ -96,8 +97,9 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "further_sources": [estimate_summary(one, record) for one in record.further],
         "noticed_mbq": {name: value if np.isfinite(value) else None for name, value in record.noticed_mbq.items()},
         "nuclide": {
-            "name": named(spectrum),
+            "name": named(record),
             "confidence": None if spectrum is None else float(spectrum.confidence),
+            "of_source": record.examined,
         },
         "dose_rate": dose_summary(record),
         "drawn": dict(record.drawn),
@@ -260,19 +262,23 @@ def dose_summary(record: MissionRecord) -> dict[str, Any] | None:
     Natural background is included. It is the reading that is greatest less two standard deviations: of thousands of
     readings of a few counts each, the greatest one is chance. The standard deviation is that of counting alone, without
     the error of the conversion (see `swarmsim.radiation.dose_operator`). Where a counter was saturated there is none,
-    and the rates are ``lower_bounds``: a paralysed counter shows little where there is much.
+    and the rates are ``lower_bounds``, two standard deviations below the reading: a paralysed counter shows little
+    where there is much.
     """
     samples = record.samples
     ambient, std, kerma = samples.dose_rate_usv_h, samples.dose_rate_std_usv_h, samples.kerma_rate_ugy_h
     if ambient is None or std is None or kerma is None or not len(ambient):
         return None
-    best = int(np.argmax(ambient - SURE_SIGMA * std))
+    sure = np.maximum(ambient - SURE_SIGMA * std, 0.0)
+    best = int(np.argmax(sure))
+    bounds = record.status == "saturated" or (samples.saturated is not None and bool(np.any(samples.saturated)))
+    share = float(sure[best] / ambient[best]) if bounds and ambient[best] > 0.0 else 1.0
     return {
         "basis": "counts",
-        "greatest_usv_h": float(ambient[best]),
-        "greatest_std_usv_h": None if record.status == "saturated" else float(std[best]),
-        "lower_bounds": record.status == "saturated",
-        "greatest_kerma_ugy_h": float(kerma[best]),
+        "greatest_usv_h": share * float(ambient[best]),
+        "greatest_std_usv_h": None if bounds else float(std[best]),
+        "lower_bounds": bounds,
+        "greatest_kerma_ugy_h": share * float(kerma[best]),
         "vehicle": record.vehicles[int(samples.vehicle[best])].name,
         "time_s": float(samples.time_s[best]),
         "position_m": plain(samples.position_m[best]),
@@ -296,9 +302,12 @@ def energy_wh(vehicle: VehicleRecord) -> float:
     return float(vehicle.energy_wh[-1]) if len(vehicle.energy_wh) else 0.0
 
 
-def named(spectrum: Spectrum | None) -> str | None:
-    """The nuclide that a spectrum names, if it names one."""
-    return None if spectrum is None or spectrum.nuclide in ("none", "unknown") else spectrum.nuclide
+def named(record: MissionRecord) -> str | None:
+    """The nuclide that the spectrum names, if it names one: near a source that was found, as sure as is asked for."""
+    spectrum = record.spectrum
+    if spectrum is None or record.examined is None or not spectrum.sure:
+        return None
+    return None if spectrum.nuclide in ("none", "unknown") else spectrum.nuclide
 
 
 def plain(values: NDArray[np.floating]) -> list[float]:
@@ -325,9 +334,9 @@ def versions() -> dict[str, str]:
 def succeeded(record: MissionRecord) -> bool:
     """Whether the mission did what it was for: no crash, no failsafe, no phase out of time, and the answer is right.
 
-    Right is a source located, with that status, and, where the mission identifies nuclides, the nuclide of the nearest
-    true source named; or, where there is no source, the status "none". A mission that looks for nothing has no answer
-    to give.
+    Right is a source located, with that status, and, where the mission identifies nuclides, that of the source named
+    near which the spectrum was taken; or, where there is no source, the status "none". A mission that looks for nothing
+    has no answer to give.
     """
     if any(v.crashed for v in record.vehicles) or not all(phase.in_time for phase in record.phases):
         return False
@@ -342,5 +351,7 @@ def succeeded(record: MissionRecord) -> bool:
         return False
     if record.sought == "source":
         return True
-    nearest, _ = nearest_of(np.asarray(record.estimate.position_m, float), active)
-    return nearest is not None and named(record.spectrum) == nearest.nuclide
+    if record.examined is None:
+        return False
+    nearest, _ = nearest_of(np.asarray(record.estimates[record.examined].position_m, float), active)
+    return nearest is not None and named(record) == nearest.nuclide

@@ -21,7 +21,8 @@ _MEASURED = (
     "window); exposure_s is the real time that counts stand for, dead time included (1 s for an idealised one), and "
     "count_rate_cps the counts over it; live_s is the live time, the exposure less the dead time by the detector's "
     "law; dose rates are ambient dose equivalent H*(10) and air kerma by the counts over the live time, background "
-    "included, and lower bounds where the counter was saturated"
+    "included, and doubtful where the counter was saturated: near the highest rate that it can show, or, of one that "
+    "dead time paralyses, showing less than a tenth of its background"
 )
 _SPECTRUM = (
     "spectrum that the nuclide was identified by, summed over samples near the source (energy: centre of the channel) "
@@ -77,6 +78,8 @@ def _instrument_columns(record: MissionRecord) -> dict[str, Any]:
     for name in DOSES:
         if (values := getattr(samples, name)) is not None:
             columns[name] = values.astype(np.float32)
+    if samples.saturated is not None:
+        columns["saturated"] = samples.saturated
     if samples.windows is not None:
         for k, window in enumerate(record.windows_kev):
             counts = samples.windows[:, k]
@@ -104,6 +107,7 @@ def spectrum_table(record: MissionRecord, spectrum: Spectrum) -> pa.Table:
         "detector": spectrum.detector,
         "nuclide": spectrum.nuclide,
         "confidence": repr(float(spectrum.confidence)),
+        "sure": repr(bool(spectrum.sure)),
     }
     return pa.table(columns, metadata=_metadata(record, _SPECTRUM) | told)
 

@@ -193,8 +193,9 @@ class MissionRun:
             return None
         self._tell.phase("estimate and identify", 0.0)
         everyone, measured = np.ones(self._batch.missions, bool), self._measured(mission)
-        if not self._plan.asks:
-            known = self._learned(measured, known, everyone, afresh=True)
+        unasked = ~self._plan.asked(mission.phases) if self._plan.asks else everyone
+        if unasked.any():  # what there is to know of their counts is not known yet
+            known = self._learned(measured, known, unasked, afresh=True)
         spectrum: Accumulated | None = None
         identification: Identification | None = None
         guided = known

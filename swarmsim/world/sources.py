@@ -1,7 +1,5 @@
 """The sources of a scenario as points, built on the host."""
 
-import math
-
 import numpy as np
 
 from swarmsim.config.scenario import Scenario
@@ -50,12 +48,11 @@ def build_sources(
     of = np.concatenate(number).astype(int)
     nuclide = np.array([library.nuclide_index(s.nuclide) for s in truths] or [0])[of]
     activity = np.array([1e6 * s.activity_mbq for s in truths] or [0.0])[of] * np.concatenate(share)
-    decay = np.array([math.log(2.0) / n.half_life_s for n in library.nuclides])
     points = Source(
         position_m=on_host(np.concatenate(place)), activity_bq=on_host(activity), nuclide=on_host(nuclide, np.int32)
     )
     return points, Emission(
-        decay_1_s=on_host(decay[nuclide]),
+        decay_1_s=on_host(np.array(library.decay_1_s)[nuclide]),
         number=on_host(of, np.int32),
         carrier=on_host(carrier, np.int32) if carrier else None,
         corners_m=on_host(np.concatenate(corners)) if corners else None,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from swarmsim.results.record import Estimate, GammaConstant, RadiationMap, Samples
+from swarmsim.results.saturation import saturated
 from swarmsim.results.status import CERTAIN, Fit, assess, coverage, source_of_spectrum, survey_doubts
 
 GOOD = Fit(misfit=0.3, chi_squared=1.01)
@@ -45,9 +46,9 @@ def verdict(
 ):  # fmt: skip
     samples = survey() if samples is None else samples
     n = len(samples.counts)
-    limits = (np.full(n, highest), np.full(n, 94.0))
+    beyond = saturated(samples.vehicle, samples.counts, samples.exposure_s, np.full(n, highest), np.full(n, 94.0))
     return assess(
-        samples, chart(hotspots, rate), limits, np.zeros(n), fit,
+        replace(samples, saturated=beyond), chart(hotspots, rate), np.zeros(n), fit,
         (aerial or (estimate(1.0),)) if found else (), (final or (estimate(),)) if found else (), 0.3,
         (presumed[0], float(np.log(presumed[1]))), at_1_m, identified, suggested,
         spectrum_of, noticed, heights=heights,
@@ -233,12 +234,12 @@ def test_a_source_far_from_the_height_presumed_is_doubtful() -> None:
 
 def test_counts_of_a_nuclide_that_is_not_in_question_are_told() -> None:
     none = {"found": False, "hotspots": ()}
-    assert verdict(**none, fit=replace(GOOD, excluded=0.9)).status == "none"
-    told = verdict(**none, fit=replace(GOOD, excluded=1.1))
+    assert verdict(**none, fit=replace(GOOD, unsought=0.9)).status == "none"
+    told = verdict(**none, fit=replace(GOOD, unsought=1.1))
     assert told.status == "inconsistent"
     assert told.reasons == ("the counts show a source of a nuclide that is not in question (knowledge.nuclides)",)
     # what the model does not know of a strong source looks like others beside it
-    assert verdict(fit=replace(GOOD, excluded=9.0)).status == "located"
+    assert verdict(fit=replace(GOOD, unsought=9.0)).status == "located"
 
 
 def test_where_a_counter_was_saturated_no_error_of_a_place_is_told() -> None:

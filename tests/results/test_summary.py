@@ -130,7 +130,7 @@ def test_every_key_that_users_rely_on(found: MissionRecord) -> None:
     source = {"position_m", "position_std_m", "error_m", "activity_mbq", "activity_error_percent"}
     assert source <= set(made["source"])
     assert set(made["survey_estimate"]) == set(made["source"])
-    assert set(made["nuclide"]) == {"name", "confidence"}
+    assert set(made["nuclide"]) == {"name", "confidence", "of_source"}
     assert set(made["timing"]) == {"compile_s", "run_s", "write_s"}
     assert all({"name", "state", "crashed", "energy_wh"} <= set(vehicle) for vehicle in made["vehicles"])
     assert {"real_time_factor", "events", "finding", "warnings", "success", "seed", "versions"} <= set(made)
@@ -158,7 +158,7 @@ def test_errors_against_the_truth(found: MissionRecord) -> None:
     assert made["source"]["position_std_m"] == pytest.approx([np.sqrt(0.020), np.sqrt(0.012), 0.3])
     assert made["source"]["activity_error_percent"] == pytest.approx(100 * 4.0 / 170.0)
     assert made["hotspot"]["error_m"] == pytest.approx(0.8 * np.sqrt(2))
-    assert made["nuclide"] == {"name": "Co-60", "confidence": 0.9997}
+    assert made["nuclide"] == {"name": "Co-60", "confidence": 0.9997, "of_source": 0}
 
 
 def test_an_estimate_has_its_nuclide_the_true_one_and_the_covariance_of_its_place(found: MissionRecord) -> None:
@@ -207,7 +207,7 @@ def test_nothing_found_is_null_and_still_json(nothing: MissionRecord) -> None:
     made = json.loads(json.dumps(summary(nothing, TIMINGS), allow_nan=False))
     assert made["hotspot"] == {"position_m": None, "error_m": None}
     assert set(made["source"].values()) == {None}
-    assert made["nuclide"] == {"name": None, "confidence": None}
+    assert made["nuclide"] == {"name": None, "confidence": None, "of_source": None}
     assert list(made["phases"]) == ["survey"]
     assert made["phases"]["survey"]["measurements"] > 7000
     assert made["finding"] == "No source above background."
