@@ -5,7 +5,7 @@ A figure that would be empty is left out.
 
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
 from swarmsim.playback import plan
@@ -40,6 +40,7 @@ NEAR_SHARE, MOST_SHARE = 0.18, 0.35  # of the site's smaller side: half sides of
 NOWHERE = np.zeros((0, 2))
 _TRACK_POINTS_MAX = 50_000  # of all vehicles
 _TRACK_COLUMNS = 3  # of the legend
+_DECIMALS_MOST = 6  # of a contour's label
 
 
 def write(record: MissionRecord, site_model: SiteModel, folder: Path) -> list[Path]:
@@ -115,7 +116,7 @@ def flown_measurements(phase: Phase, record: MissionRecord, site_model: SiteMode
 
 
 def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
-    """The interpolated map with contours, hotspots, truth and the estimate of then; what was found close up too."""
+    """The interpolated map with contours, hotspots, truth and the estimates of then; what was found close up too."""
     made = record.map
     assert made is not None
     if record.survey_estimate is None and not len(made.hotspots_m):
@@ -131,7 +132,7 @@ def radiation_map(record: MissionRecord, site_model: SiteModel) -> Figure:
             axes.plot(*made.hotspots_m.T, linestyle="none", marker="o", markersize=9.0, markerfacecolor="none",
                       markeredgecolor="black", markeredgewidth=1.0, label="hotspot", zorder=6)  # fmt: skip
         plan.draw_truth(axes, record)
-        plan.draw_estimate(axes, record.survey_estimate, "survey estimate")
+        plan.draw_estimates(axes, record.survey_estimates, "survey estimate")
     plan.colour_bar(figure, shown[-1], image, "Count rate, interpolated [1/s]")
     handles, _ = whole.get_legend_handles_labels()
     handles.append(Line2D([], [], color="0.2", linewidth=0.7, label="obstacles"))
@@ -158,23 +159,32 @@ def _draw_map(axes: Axes, made: RadiationMap) -> AxesImage:
             float(level) for level in MaxNLocator(6).tick_values(low, high) if low + 0.02 * (high - low) < level < high
         ]
         lines = axes.contour(x, y, made.mean_cps, levels=levels, colors="white", linewidths=0.5, zorder=3)
-        axes.clabel(lines, levels[:3], fmt="%.0f", fontsize=7.0)
+        axes.clabel(lines, levels[:3], fmt=_exact(levels), fontsize=7.0)
     axes.set_xlim(limits[0])
     axes.set_ylim(limits[1])
     return image
 
 
+def _exact(levels: Sequence[float]) -> str:
+    """The format with the fewest decimals that tells levels exactly, all of them with as many."""
+    needed = (d for d in range(_DECIMALS_MOST) if np.allclose(np.round(levels, d), levels, rtol=1e-6, atol=0.0))
+    return f"%.{next(needed, _DECIMALS_MOST)}f"
+
+
 def driven_measurements(phase: Phase, record: MissionRecord, site_model: SiteModel) -> Figure:
     """Count rates of a phase that was driven, along the planned paths, with a close-up.
 
-    The close-up shows the estimate and the greatest count rate, or the latter alone where they lie far apart.
+    The close-up shows the greatest count rate and the estimate nearest to it, or the former alone where they lie far
+    apart.
     """
     samples = record.samples.of_phase(phase.name)
     rate = smoothed_rate(samples)
     norm = log_scale(rate).norm
     x, y, _ = samples.position_m.T
     strongest = samples.position_m[[np.argmax(rate)], :2]
-    centre, half = _close_up(record.estimate, strongest, site_model, strongest)
+    off_m = [float(np.linalg.norm(one.position_m[:2] - strongest[0])) for one in record.estimates]
+    nearest = record.estimates[int(np.argmin(off_m))] if off_m else None
+    centre, half = _close_up(nearest, strongest, site_model, strongest)
     figure, whole, close = plan.new_pair(site_model, centre, half)
     paths = [record.paths_m[number] for number in phase.vehicles if number in record.paths_m]
     for axes, size in ((whole, 5.0), (close, 14.0)):
@@ -183,7 +193,7 @@ def driven_measurements(phase: Phase, record: MissionRecord, site_model: SiteMod
             axes.plot(*path[:, :2].T, "-", color="0.45", linewidth=0.7, label=label, zorder=3)
         axes.scatter(x, y, c=rate, s=size, cmap=RATE_MAP, norm=norm, linewidths=0, zorder=5, rasterized=True)
         plan.draw_truth(axes, record)
-        plan.draw_estimate(axes, record.estimate, "final estimate")
+        plan.draw_estimates(axes, record.estimates, "final estimate")
     bar = plan.colour_bar(figure, close, ScalarMappable(norm=norm, cmap=RATE_MAP), _RATE_LABEL)
     _plain_log_ticks(bar, norm)
     handles, _ = whole.get_legend_handles_labels()
@@ -195,7 +205,7 @@ def _plain_log_ticks(bar: Axes, norm: object) -> None:
     """Ticks at 1, 2, 5 times powers of ten, written as plain numbers."""
     assert isinstance(norm, LogNorm)
     bar.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    bar.yaxis.set_major_formatter(ScalarFormatter())
+    bar.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     bar.yaxis.set_minor_formatter(NullFormatter())
 
 

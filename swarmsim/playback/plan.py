@@ -1,6 +1,6 @@
 """The site plan under every map figure: axes to scale, buildings in grey, north arrow, and print settings."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal
 
@@ -234,22 +234,29 @@ def draw_truth(axes: Axes, record: MissionRecord) -> None:
         )
 
 
-def draw_estimate(axes: Axes, estimate: Estimate | None, label: str) -> None:
-    """A dot at the estimate and the ellipse that holds 95 % of its horizontal uncertainty, if that is known."""
-    if estimate is None:
-        return
-    centre = estimate.position_m[:2]
-    label = f"{label}, 95 % ellipse" if estimate.errors_known else f"{label} (saturated counter)"
-    axes.plot(*centre, linestyle="none", marker="o", markersize=3.0, color=ESTIMATE, markeredgecolor="white",
-              markeredgewidth=0.4, label=label, zorder=8)  # fmt: skip
-    if not estimate.errors_known:
-        return
+def draw_estimates(axes: Axes, estimates: Sequence[Estimate], label: str) -> None:
+    """A dot at each estimate and the ellipse that holds 95 % of its horizontal uncertainty, if that is known.
+
+    The legend has one entry for those with an ellipse, and one for those without.
+    """
+    for known in (True, False):
+        alike = [one for one in estimates if one.errors_known == known]
+        if not alike:
+            continue
+        plural = "s" if len(alike) > 1 else ""
+        entry = f"{label}{plural}, 95 % ellipse{plural}" if known else f"{label}{plural} (saturated counter)"
+        places = np.array([one.position_m[:2] for one in alike], float)
+        axes.plot(*places.T, linestyle="none", marker="o", markersize=3.0, color=ESTIMATE, markeredgecolor="white",
+                  markeredgewidth=0.4, label=entry, zorder=8)  # fmt: skip
+        for one in alike if known else ():
+            axes.add_patch(_ellipse(one))
+
+
+def _ellipse(estimate: Estimate) -> Ellipse:
+    """The outline that holds 95 % of an estimate's horizontal uncertainty."""
+    x, y = map(float, estimate.position_m[:2])
     width, height, angle = ellipse_95(estimate.covariance_m2)
-    axes.add_patch(
-        Ellipse(
-            (centre[0], centre[1]), width, height, angle=angle, fill=False, edgecolor=ESTIMATE, linewidth=1.0, zorder=8
-        )
-    )
+    return Ellipse((x, y), width, height, angle=angle, fill=False, edgecolor=ESTIMATE, linewidth=1.0, zorder=8)
 
 
 def ellipse_95(covariance_m2: NDArray[np.floating]) -> tuple[float, float, float]:

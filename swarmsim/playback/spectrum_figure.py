@@ -8,6 +8,7 @@ from scipy.optimize import isotonic_regression
 
 from swarmsim.playback import plan
 from swarmsim.playback.colours import ESTIMATE
+from swarmsim.results.doubts import CONFIRMED
 from swarmsim.results.record import Spectrum
 
 _BINS = 256  # merged channels: narrower than any peak of NaI, wide enough for a readable histogram
@@ -54,12 +55,16 @@ def spectrum_figure(spectrum: Spectrum) -> Figure:
 
 
 def spectrum_title(spectrum: Spectrum) -> str:
-    """What the spectrum names, with its confidence to three digits, never rounded up to certainty."""
+    """What the spectrum names, with its confidence to three digits, never rounded up to certainty.
+
+    Further nuclides that it is sure of come after it.
+    """
     if spectrum.nuclide == "none":
         return "no nuclide named"
     confidence = "> 0.999" if spectrum.confidence > 0.999 else f"{spectrum.confidence:.3f}"
     named = "not in the library" if spectrum.nuclide == "unknown" else spectrum.nuclide
-    return f"{named}, confidence {confidence}"
+    further = [name for name, score in spectrum.scores.items() if score > CONFIRMED and name != spectrum.nuclide]
+    return f"{named}, confidence {confidence}" + (f"; with {' and '.join(further)}" if further else "")
 
 
 def _merged(values: NDArray[np.floating], merge: int) -> NDArray[np.floating]:

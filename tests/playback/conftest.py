@@ -1,7 +1,10 @@
 """A mission and a site to show, made once."""
 
+from collections.abc import Iterator
+
 import pytest
 
+from swarmsim.playback import plan
 from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 from tests import synthetic
@@ -28,3 +31,10 @@ def nothing() -> MissionRecord:
 def swarm() -> MissionRecord:
     """A mission of 200 quadrotors that sought nothing."""
     return synthetic.swarm()
+
+
+@pytest.fixture
+def print_style() -> Iterator[None]:
+    """Settings for print while a test runs."""
+    with plan.print_style():
+        yield

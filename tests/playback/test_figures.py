@@ -1,8 +1,6 @@
 """What is on the figures, asked of the figures themselves."""
 
 import dataclasses
-from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 
 import matplotlib.image
@@ -11,31 +9,16 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection, PolyCollection
 from matplotlib.contour import QuadContourSet
-from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from matplotlib.text import Text
 
 from swarmsim.playback import figures, plan
 from swarmsim.playback.colours import TRUTH, away_from_pads, rate_scales
 from swarmsim.results.record import MissionRecord
 from swarmsim.site.model import SiteModel
 from tests import synthetic
+from tests.playback.prints import check_print, labels, texts
 
-
-@pytest.fixture(autouse=True)
-def _style() -> Iterator[None]:
-    with plan.print_style():
-        yield
-
-
-def texts(figure: Figure) -> list[str]:
-    return [text.get_text() for text in figure.findobj(Text) if text.get_visible() and text.get_text()]
-
-
-def labels(axes: Axes) -> list[str]:
-    legend = axes.get_legend()
-    assert legend is not None
-    return [text.get_text() for text in legend.get_texts()]
+pytestmark = pytest.mark.usefixtures("print_style")
 
 
 def check_plan(axes: Axes) -> None:
@@ -143,6 +126,55 @@ def test_an_estimate_whose_errors_are_not_known_has_no_ellipse(found: MissionRec
     check_print(figure)
 
 
+@pytest.fixture
+def three(found: MissionRecord) -> MissionRecord:
+    """The mission with two further sources, one of them on its close-up and one far off."""
+    survey, final = found.survey_estimate, found.estimate
+    assert survey is not None
+    assert final is not None
+    places = (np.array([18.0, -1.0, 1.0]), np.array([-40.0, -30.0, 1.0]))
+    return dataclasses.replace(
+        found,
+        survey_further=tuple(dataclasses.replace(survey, position_m=place + 0.5) for place in places),
+        further=tuple(dataclasses.replace(final, position_m=place) for place in places),
+    )
+
+
+def test_every_source_found_is_drawn_under_one_entry(three: MissionRecord, site: SiteModel) -> None:
+    of_map, of_search = (
+        figures.figures_of(three)[name](three, site) for name in ("radiation_map", "measurements_search")
+    )
+    for figure, estimates, name in ((of_map, three.survey_estimates, "survey"), (of_search, three.estimates, "final")):
+        places = [one.position_m[:2] for one in estimates]
+        for axes in figure.axes[:2]:
+            np.testing.assert_allclose([p.center for p in axes.patches if isinstance(p, Ellipse)], places)
+            (dots,) = [line for line in axes.lines if str(line.get_label()).startswith(name)]
+            np.testing.assert_allclose(dots.get_xydata(), places)
+        assert [each for each in labels(figure.axes[0]) if name in each] == [f"{name} estimates, 95 % ellipses"]
+        check_print(figure)
+
+
+def test_sources_with_and_without_known_errors_have_an_entry_each(three: MissionRecord, site: SiteModel) -> None:
+    near, far = three.survey_further
+    mixed = (dataclasses.replace(near, errors_known=False), far)
+    figure = figures.radiation_map(dataclasses.replace(three, survey_further=mixed), site)
+    entries = {"survey estimates, 95 % ellipses", "survey estimate (saturated counter)"}
+    assert entries <= set(labels(figure.axes[0]))
+    assert len([p for p in figure.axes[0].patches if isinstance(p, Ellipse)]) == 2
+    check_print(figure)
+
+
+def test_a_close_up_of_ground_counts_shows_the_source_that_was_examined(three: MissionRecord, site: SiteModel) -> None:
+    """The surest source is another one."""
+    assert three.estimate is not None
+    place = three.estimate.position_m[:2] + np.array([14.0, 0.0])
+    examined = dataclasses.replace(three.estimate, position_m=np.array([*place, 1.0]))
+    swapped = dataclasses.replace(three, estimate=three.further[1], further=(examined,))
+    close = figures.driven_measurements(three.phases[1], swapped, site).axes[1]
+    low, high = np.transpose([close.get_xlim(), close.get_ylim()])
+    assert np.all((low + 3.0 <= place) & (place <= high - 3.0))
+
+
 def test_ellipse_holds_95_percent_of_a_normal_distribution(found: MissionRecord) -> None:
     assert found.survey_estimate is not None
     covariance = found.survey_estimate.covariance_m2
@@ -193,49 +225,6 @@ def test_close_up_of_a_phase_far_from_the_estimate_shows_its_greatest_rate(
     assert np.linalg.norm(centre - synthetic.SOURCE_M[:2]) < 6.0
 
 
-def test_spectrum_has_its_fit_lines_and_residuals(found: MissionRecord, site: SiteModel) -> None:
-    figure = figures.spectrum(found, site)
-    upper, lower = figure.axes
-    assert upper.get_yscale() == "log"
-    assert lower.get_xlabel() == "Energy [keV]"
-    assert upper.get_ylabel() == "Counts per 11.7 keV"
-    assert found.spectrum is not None
-    measured = next(line for line in upper.lines if str(line.get_label()).startswith("measured"))
-    assert np.sum(measured.get_ydata()) == pytest.approx(found.spectrum.counts.sum())
-    places = {text.get_text(): text.get_position()[0] for text in upper.texts}
-    assert places == {"1173 keV": pytest.approx(1173.2), "1332 keV": pytest.approx(1332.5)}
-    residuals = np.asarray(lower.lines[-1].get_ydata())
-    assert residuals.std() == pytest.approx(1.0, abs=0.15)  # the fit is the truth here
-    assert "Co-60, confidence > 0.999" in texts(figure)
-
-
-@pytest.mark.parametrize(
-    ("lines", "said"),
-    [
-        ([661.7, 36.4, 31.8, 32.2], ["32–36 keV", "662 keV"]),
-        ([39.5, 45.4, 121.8, 1085.8, 1089.7, 1112.1], ["40–45 keV", "122 keV", "1088 keV", "1112 keV"]),
-        ([1368.6, 2754.0, 2994.0], ["1369 keV", "2754 keV", "2994 keV"]),
-        ([], []),
-        ([*np.arange(30.0, 2990.0, 20.0)], ["30–2970 keV"]),
-    ],
-)
-def test_labels_of_lines_are_beside_one_another_above_the_curves(
-    lines: list[float], said: list[str], found: MissionRecord, site: SiteModel
-) -> None:
-    assert found.spectrum is not None
-    spectrum = dataclasses.replace(found.spectrum, lines_kev=np.array(lines))
-    figure = figures.spectrum(dataclasses.replace(found, spectrum=spectrum), site)
-    figure.canvas.draw()
-    upper = figure.axes[0]
-    assert [text.get_text() for text in upper.texts] == said
-    inside = upper.get_window_extent()
-    boxes = [Text.get_window_extent(text) for text in upper.texts]  # without the leader
-    assert all(inside.x0 <= b.x0 and b.x1 <= inside.x1 and b.y1 <= inside.y1 for b in boxes)
-    assert all(a.x1 <= b.x0 + 0.5 for a, b in pairwise(boxes))
-    top = upper.transData.transform((0.0, float(np.max(upper.lines[0].get_ydata()))))[1]
-    assert all(b.y0 > top for b in boxes)
-
-
 NAMES = ["trajectories", "measurements_survey", "measurements_search", "radiation_map", "spectrum"]
 
 
@@ -259,6 +248,28 @@ def test_rates_of_many_digits_leave_room_for_their_label(times: float, found: Mi
     assert min(contours.levels) > 0.0
 
 
+@pytest.mark.parametrize("times", [0.003, 0.01, 0.03, 1.0, 3e4])
+def test_labels_of_contours_tell_their_levels(times: float, found: MissionRecord, site: SiteModel) -> None:
+    """Those of a Geiger tube are of few counts a second."""
+    assert found.map is not None
+    scaled = dataclasses.replace(found.map, mean_cps=times * found.map.mean_cps)
+    figure = figures.radiation_map(dataclasses.replace(found, map=scaled), site)
+    (contours,) = [c for c in figure.axes[0].collections if isinstance(c, QuadContourSet)]
+    told = {text.get_text() for text in contours.labelTexts}
+    assert sorted(map(float, told)) == pytest.approx(list(contours.levels[:3]), rel=1e-6)
+    assert max(map(len, told)) <= 7
+
+
+def test_rates_of_a_geiger_tube_on_the_ground_have_ticks_of_plain_numbers(
+    found: MissionRecord, site: SiteModel
+) -> None:
+    samples = dataclasses.replace(found.samples, counts=0.01 * np.asarray(found.samples.counts))
+    figure = figures.driven_measurements(found.phases[1], dataclasses.replace(found, samples=samples), site)
+    figure.canvas.draw()
+    ticks = [text.get_text() for text in figure.axes[2].get_yticklabels()]
+    assert {"2", "5", "10", "20", "50"} <= set(ticks)
+
+
 @pytest.mark.parametrize("count", [1, 12, 13])
 def test_trajectories_of_any_team_have_room_for_their_legend(count: int, site: SiteModel) -> None:
     team = synthetic.swarm(count, 30.0)
@@ -266,19 +277,6 @@ def test_trajectories_of_any_team_have_room_for_their_legend(count: int, site: S
     check_print(figure)
     named = [vehicle.name for vehicle in team.vehicles] if count <= 12 else ["13 x500"]
     assert labels(figure.axes[0]) == [*named, "start", "obstacles"]
-
-
-def check_print(figure: Figure) -> None:
-    """A column wide, letters of a readable size, nothing cut off."""
-    figure.canvas.draw()
-    width = figure.get_figwidth()
-    assert width in (plan.SINGLE_COLUMN_IN, plan.DOUBLE_COLUMN_IN)
-    assert min(text.get_fontsize() for text in figure.findobj(Text) if text.get_text()) >= 6.9
-    ink = figure.get_tightbbox(figure.canvas.get_renderer())
-    assert ink.x0 >= 0.0, "cut off on the left"
-    assert ink.y0 >= 0.0, "cut off at the bottom"
-    assert ink.x1 <= width, "cut off on the right"
-    assert ink.y1 <= figure.get_figheight(), "cut off at the top"
 
 
 def test_written_at_300_dpi(found: MissionRecord, site: SiteModel, tmp_path: Path) -> None:
