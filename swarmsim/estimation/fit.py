@@ -126,9 +126,32 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
     )
 
 
-@jax.jit  # traced once for all places of a program that call it
 def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Unknowns:
-    """Where a fit at a new place starts: the activity, and each window's background and gain, all else as in ``u``.
+    """Where a fit at a new place starts: the activity, and each window's background and gain, all else as in ``u``."""
+    begun, amount, beside, variance = _put_together(problem, source, others, where, u)
+
+    def strong() -> Unknowns:
+        factor, _ = likeliest(problem, amount, beside, variance)
+        own, same = jnp.zeros_like(begun.gain), factor == 1.0
+        return replace(
+            begun,
+            activity_bq=factor * begun.activity_bq,
+            gain=jnp.where(same, begun.gain, own),
+            background=jnp.where(same, begun.background, own),
+        )
+
+    # not in the function that is traced once: JAX 0.11 gives a program twice its arguments where an accelerator's
+    # groups are chosen inside of one
+    return for_those(overloaded(problem), strong, lambda: begun)
+
+
+@jax.jit  # traced once for all places of a program that call it
+def _put_together(
+    problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns
+) -> tuple[Unknowns, jax.Array, jax.Array, jax.Array]:
+    """Where a fit starts by a score at each window, if no counter was overloaded.
+
+    And counts [n] that the source adds then, those [n] of all else, and the variance [n] of the former's logarithm.
 
     Each window by itself tells an amplitude of the source; they are put together as the model of a window's error has
     it. At a wrong place many windows are off by factors, to which a few Gauss-Newton steps would not come.
@@ -174,19 +197,7 @@ def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u:
     signal = (level * net + rest) * jnp.exp(gain)[:, None]
     of_rest = over(background * (m.rois - background - signal)) / of_background
     begun = replace(u, activity_bq=level / unit, gain=gain, background=jnp.clip(of_rest, -1.0, 1.0))
-
-    def strong() -> Unknowns:
-        beside = known + jnp.sum(background, axis=1)
-        factor, _ = likeliest(problem, level * total, beside, variance)
-        own, same = jnp.zeros_like(gain), factor == 1.0
-        return replace(
-            begun,
-            activity_bq=factor * level / unit,
-            gain=jnp.where(same, begun.gain, own),
-            background=jnp.where(same, begun.background, own),
-        )
-
-    return for_those(overloaded(problem), strong, lambda: begun)
+    return begun, level * total, known + jnp.sum(background, axis=1), variance
 
 
 def alone(problem: Problem, others: Others, u: Unknowns, steps: int) -> tuple[Unknowns, Linearised]:

@@ -44,7 +44,7 @@ place of one 400 to 1300.
 APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 EXCLUDED = "the counts show a source of a nuclide that is not in question (knowledge.nuclides)"
-MORE = "the counts show more sources than are sought (localisation.sources_max)"
+MORE = "as many sources are found as are sought (localisation.sources_max), so that there may be more"
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
 UNEXPLAINED_SIGMA = 3.0  # of the background: a hotspot that exceeds it by less may be of the background
 
@@ -124,8 +124,10 @@ def assess(
     doubts += companions(final, strength, examined, identified) + implausible(final, *activity)
     doubts += mixed(final, examined, identified) + contradicted(final, examined, suggested, identified)
     doubts += unsure_nuclides(final, examined, suggested) + unusual_heights(final, heights)
-    if fit.unsought > 1.0 and (fit.full or not final):
-        doubts.append(("ambiguous", MORE) if fit.full else ("inconsistent", EXCLUDED))
+    if fit.full and (len(final) > 1 or fit.unsought > 1.0):  # who seeks one knows that there is one
+        doubts.append(("ambiguous", MORE))
+    if not final and fit.unsought > 1.0:
+        doubts.append(("inconsistent", EXCLUDED))
     if doubts and status in ("located", "none"):
         status = doubts[0][0]
     if status == "saturated":  # no errors of places are stated

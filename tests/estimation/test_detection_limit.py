@@ -11,7 +11,8 @@ from scipy.stats import norm
 from swarmsim.device import some_at_a_time
 from swarmsim.estimation.detection_limit import MOST, limits, noticed
 from swarmsim.estimation.localise import localisation_params, problem_of
-from swarmsim.estimation.scan import open_counts, scan
+from swarmsim.estimation.overload import overloaded
+from swarmsim.estimation.scan import open_counts, open_totals, scan
 from swarmsim.estimation.search import attempt
 from swarmsim.estimation.state import no_sources, settled
 from tests.estimation.survey import NUCLIDES, counted, mean_rois, place, presumed, spec, spectrometer, survey
@@ -135,10 +136,33 @@ def test_a_source_of_another_nuclide_than_those_in_question_shows():
 
 
 def test_where_as_many_sources_are_known_as_are_sought_no_further_one_is_noticed():
-    problem, state = _nothing(jnp.float32(BACKGROUND))
+    state = _nothing(jnp.float32(BACKGROUND))[1]
     full = replace(state, sources=replace(state.sources, present=jnp.ones(1, bool)))
-    told, _ = jax.jit(lambda s: noticed(problem, KNOWN.places, ALL, SEARCH, s))(full)
+    search = jax.jit(lambda rois, s: noticed(_nothing(rois)[0], KNOWN.places, ALL, SEARCH, s))
+    told, unsought = search(jnp.float32(BACKGROUND), full)
     assert np.isinf(np.asarray(told)).all()
+    assert float(unsought) < 0.5
+    # but that there is one more is told
+    there = mean_rois(SITE, DETECTORS, FLIGHT, [((10.0, 4.0, 1.0), 3e8, "Co-60")])
+    assert float(search(jnp.float32(np.round(there)), full)[1]) > 1.0
+
+
+def test_beside_a_source_that_overloads_a_counter_only_what_is_believed_is_noticed():
+    """A limit of 29 MBq was told where one of 590 was not found."""
+    there = mean_rois(SITE, DETECTORS, FLIGHT, [((-20.0, -20.0, 1.0), 1e8, "Co-60")])
+    strong = np.maximum(np.asarray(there) - BACKGROUND, 0.0)
+    dead_s = float(jnp.sum(DETECTORS[0].paralyzable_s + DETECTORS[0].non_paralyzable_s))
+    rate = strong.sum(axis=1) / np.asarray(FLIGHT.exposure_s)
+    counts = 0.3 / (dead_s * rate.max()) * strong
+    shown = np.exp(-0.3 * rate / rate.max())[:, None] * (BACKGROUND + counts)
+    problem, state = _nothing(jnp.float32(np.round(shown)))
+    assert bool(overloaded(problem))
+    added = replace(state.added, counts=jnp.broadcast_to(jnp.float32(counts), state.added.counts.shape))
+    told = jax.jit(lambda p, s: noticed(p, KNOWN.places, ALL, SEARCH, s)[0])(problem, replace(state, added=added))
+    points = jnp.asarray(KNOWN.places.points_m)
+    own = told[CO_60] * open_totals(problem, points, jnp.full(len(points), CO_60))
+    shares = np.max(np.asarray(own) / np.maximum(counts.sum(axis=1), 1e-6), axis=1)
+    assert 0.94 <= np.mean(shares > 0.3 - 1e-3) < 1.0
 
 
 def test_a_straight_way_is_counted_as_the_places_along_it():

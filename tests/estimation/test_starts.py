@@ -106,3 +106,17 @@ def test_points_outside_of_the_areas_are_not_surveyed():
     share = places.surveyed.mean()
     assert share == pytest.approx(0.5, abs=0.05)
     assert places_of(place(), [CORNERS], 4.0, 1.0).surveyed.all()
+
+
+@given(angle=st.floats(0.0, 3.1), width=st.floats(0.2, 6.0), x=st.floats(-20.0, 20.0), y=st.floats(-20.0, 20.0))
+def test_an_area_narrower_than_the_grid_has_a_point_to_be_judged_by(angle, width, x, y):
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    strip = np.array([x, y]) + np.array(
+        [30.0 * a * along + 0.5 * width * b * across for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    )
+    places = places_of(place(), [strip, CORNERS], 4.0, 1.0)
+    near = places.points_m[places.surveyed, :2]
+    alone = places_of(place(), [strip], 4.0, 1.0)
+    assert alone.surveyed.any()
+    assert np.all(np.abs((alone.points_m[alone.surveyed, :2] - [x, y]) @ across) < 0.5 * width + 4.0)
+    assert len(near) > alone.surveyed.sum()

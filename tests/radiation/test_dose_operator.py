@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmsim.config.load import load_named
-from swarmsim.radiation import Detector, Library, Source, build_detector, build_dosimeter, net_rate, roi_rates
+from swarmsim.radiation import Detector, Library, Source, build_detector, build_dosimeter, net_rate, rate, roi_rates
 from swarmsim.radiation.dose import gamma_constant
 from swarmsim.radiation.dose_operator import DoseOperator, dose_operator
 from swarmsim.radiation.rate import registered_share
@@ -107,6 +107,37 @@ def test_a_saturated_detector_has_a_finite_reading(operator: DoseOperator) -> No
     found = operator.rates(np.full((1, 14), 1e6), np.ones(1))
     assert np.isfinite(found.ambient_usv_h).all()
     assert 0.0 < found.live_s[0] < 1.0
+
+
+@pytest.mark.parametrize(("paralyzable_s", "non_paralyzable_s"), [(0.0, 190e-6), (2e-6, 0.0), (1e-6, 1.5e-6)])
+@pytest.mark.parametrize("dead", [0.02, 0.1, 0.3])
+def test_dead_time_enlarges_the_standard_deviation(
+    operator: DoseOperator, paralyzable_s: float, non_paralyzable_s: float, dead: float
+) -> None:
+    own = dataclasses.replace(operator, paralyzable_s=paralyzable_s, non_paralyzable_s=non_paralyzable_s)
+    true = dead / (paralyzable_s + non_paralyzable_s)
+    spectrum = np.arange(1.0, 15.0) / np.arange(1.0, 15.0).sum()
+    exposure = 2000.0 / true
+    mean = rate.shown(true, paralyzable_s, non_paralyzable_s) * exposure * spectrum
+    counts = np.random.default_rng(3).poisson(mean, (20_000, 14))
+    found = own.rates(counts, np.full(20_000, exposure))
+    assert found.ambient_usv_h.std() == pytest.approx(np.sqrt(np.mean(found.ambient_std_usv_h**2)), rel=0.03)
+
+
+@pytest.mark.parametrize("dead", [3.0, 5.0, 10.0, 20.0, 50.0])
+def test_the_greatest_reading_of_a_saturated_tube_less_two_standard_deviations_is_not_much_too_large(
+    operator: DoseOperator, dead: float
+) -> None:
+    """The greatest of 300 was up to 50 times what there was."""
+    own = dataclasses.replace(operator, paralyzable_s=0.0, non_paralyzable_s=190e-6)
+    true = dead / 190e-6
+    spectrum = np.arange(1.0, 15.0) / np.arange(1.0, 15.0).sum()
+    mean = np.asarray(rate.shown(true, 0.0, 190e-6)) * spectrum
+    counts = np.random.default_rng(4).poisson(mean, (100, 300, 14)).astype(float)
+    found = own.rates(counts.reshape(-1, 14), np.ones(30_000))
+    bound = (found.ambient_usv_h - 2.0 * found.ambient_std_usv_h).reshape(100, 300).max(axis=1)
+    truth = true * spectrum @ operator.ambient
+    assert np.mean(bound < 1.15 * truth) > 0.97
 
 
 def test_no_count_at_all_is_not_certain(operator: DoseOperator) -> None:
