@@ -128,7 +128,7 @@ def test_detection_limits_are_those_of_the_last_estimate(batch):
 
 
 def test_where_a_counter_was_saturated_no_errors_are_stated(simulation, batch, monkeypatch):
-    monkeypatch.setattr("swarmsim.results.status.SATURATED_SHARE", 1e-6)
+    monkeypatch.setattr("swarmsim.results.saturation.SATURATED_SHARE", 1e-6)
     record = swarmsim.mission_record(simulation, batch, 0)
     assert record.status == "saturated"
     assert record.estimates
