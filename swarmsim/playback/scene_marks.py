@@ -9,6 +9,8 @@ from swarmsim.playback.colours import DRIVEN, ESTIMATE, FLOWN, TRUTH, RateScale,
 from swarmsim.playback.entities import TIMELINE, path_of, times
 from swarmsim.playback.growing_map import raster_at
 from swarmsim.playback.story import extent
+from swarmsim.results.doubts import in_mbq
+from swarmsim.results.finding import told_activity
 from swarmsim.results.record import Estimate, MissionRecord, TrueSource
 from swarmsim.site.model import SiteModel
 
@@ -39,7 +41,7 @@ def send_sources(stream: rr.RecordingStream, record: MissionRecord, site_model: 
 
 def _send_truth(stream: rr.RecordingStream, path: str, record: MissionRecord, source: TrueSource) -> None:
     """A pin: at a point, at the centre of a line or an area with its outline, or going with its vehicle."""
-    label = f"true {source.nuclide}, {source.activity_mbq:.0f} MBq"
+    label = f"true {source.nuclide}, {in_mbq(source.activity_mbq)}"
     if source.carrier is not None:
         carrier = record.vehicles[source.carrier]
         _pin(stream, path, np.zeros(3), 7.0, f"{label}, on {carrier.name}", TRUTH, static=True)
@@ -122,9 +124,13 @@ def _estimate(stream: rr.RecordingStream, path: str, estimate: Estimate, name: s
                 fill_mode="solid",
             ),
         )
-    std = f" ± {estimate.activity_std_mbq:.0f}" if estimate.errors_known else ""
-    label = f"{name} estimate, {estimate.activity_mbq:.0f}{std} MBq"
+    label = f"{name} estimate, {told_activity(estimate)}"
     _pin(stream, path, estimate.position_m, 15.0, label, colour, static=False)
+
+
+def _in_cps(rate_cps: float) -> str:
+    """A count rate in words, with three digits at least: a Geiger counter shows a few counts a second."""
+    return f"{rate_cps:.0f} cps" if rate_cps >= 100.0 else f"{rate_cps:.3g} cps"
 
 
 def ellipsoid(covariance_m2: NDArray[np.floating]) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
@@ -173,7 +179,7 @@ def send_legend(
                 centres[[0, -1]],
                 radii=rr.Radius.ui_points(0.5),
                 colors=[_LABEL],
-                labels=[f"{_legend_title(record, name)}: {rates[0]:.0f} cps", f"{rates[-1]:.0f} cps"],
+                labels=[f"{_legend_title(record, name)}: {_in_cps(rates[0])}", _in_cps(rates[-1])],
                 show_labels=True,
             ),
             static=True,

@@ -5,6 +5,8 @@ import rerun as rr
 
 from swarmsim.playback.entities import BODY_SCALE, TIMELINE
 from swarmsim.playback.spectrum_figure import spectrum_title
+from swarmsim.results.doubts import in_mbq
+from swarmsim.results.finding import told_activity
 from swarmsim.results.record import Estimate, MissionRecord, TrueSource
 from swarmsim.world.events import FAILSAFES
 
@@ -40,11 +42,11 @@ def describe(estimate: Estimate) -> str:
     (x, y, z), (sx, sy, sz) = estimate.position_m, np.sqrt(np.diag(estimate.covariance_m2))
     if not estimate.errors_known:
         return (
-            f"{x:.0f} m east, {y:.0f} m north, {z:.0f} m up, about {estimate.activity_mbq:.0f} MBq {estimate.nuclide}"
+            f"{x:.0f} m east, {y:.0f} m north, {z:.0f} m up, about {in_mbq(estimate.activity_mbq)} {estimate.nuclide}"
         )
     return (
         f"{x:.2f} ± {sx:.2f} m east, {y:.2f} ± {sy:.2f} m north, {z:.2f} ± {sz:.2f} m up, "
-        f"{estimate.activity_mbq:.1f} ± {estimate.activity_std_mbq:.1f} MBq {estimate.nuclide}"
+        f"{told_activity(estimate)} {estimate.nuclide}"
     )
 
 
@@ -66,7 +68,7 @@ def page(record: MissionRecord) -> str:
         for v in record.vehicles
     )
     truth = "\n".join(
-        f"- true: {s.nuclide}, {s.activity_mbq:.0f} MBq {_where(record, s)} "
+        f"- true: {s.nuclide}, {in_mbq(s.activity_mbq)} {_where(record, s)} "
         f"{s.position_m[0]:.1f} m east, {s.position_m[1]:.1f} m north, {s.position_m[2]:.1f} m up"
         for s in record.sources
     )

@@ -82,7 +82,7 @@ def _placed(estimate: Estimate) -> str:
     (xx, xy), (_, yy) = np.asarray(estimate.covariance_m2, float)[:2, :2]
     std = math.sqrt(max(0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), 0.0))
     digits = 1 if std >= 0.095 else 2
-    placed = f"{_activity(estimate)} {estimate.nuclide} at ({x:.{digits}f}, {y:.{digits}f}) ± {std:.2g} m"
+    placed = f"{told_activity(estimate)} {estimate.nuclide} at ({x:.{digits}f}, {y:.{digits}f}) ± {std:.2g} m"
     if estimate.joined_m > 0.0:
         return f"{placed} (or several within {math.ceil(estimate.joined_m)} m, or behind other walls than presumed)"
     another = f"another {estimate.nuclide} source {ONE_M:g} to {COMPANION_M:g} m off"
@@ -91,10 +91,10 @@ def _placed(estimate: Estimate) -> str:
     return f"{placed} ({another} would be noticed from {in_mbq(estimate.beside_mbq)} on)"
 
 
-def _activity(estimate: Estimate) -> str:
-    """The activity and one standard deviation of it, both to the second digit of the latter."""
+def told_activity(estimate: Estimate) -> str:
+    """The activity and, where it is known, one standard deviation of it, both to the second digit of the latter."""
     value, std = estimate.activity_mbq, estimate.activity_std_mbq
-    if not (math.isfinite(std) and std > 0.0):
+    if not (estimate.errors_known and math.isfinite(std) and std > 0.0):
         return in_mbq(value)
     digits = max(0, 1 - math.floor(math.log10(std)))
     told = f"{value:.{digits}f}"

@@ -1,8 +1,10 @@
 """The shipped mission: what it finds, what it records, and that a batch equals its missions one by one."""
 
 import json
+from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -10,6 +12,8 @@ import pytest
 import swarmsim
 from experiments.validation.missions import detectable_ratios
 from swarmsim.results.names import MEASUREMENTS, MISSIONS, TRAJECTORIES
+from swarmsim.runtime.mission_run import MissionRun
+from swarmsim.runtime.progress import SilentProgress
 from swarmsim.runtime.simulation import Simulation
 
 pytestmark = pytest.mark.optimised
@@ -125,6 +129,25 @@ def test_seeds_differ(records):
 def test_detection_limits_are_those_of_the_last_estimate(batch):
     assert np.isinf(batch.conclusion.survey.estimated.noticed_bq).all()
     assert np.isfinite(batch.conclusion.estimated.noticed_bq).all()
+
+
+def test_where_the_search_never_began_the_counts_are_still_looked_at(simulation, batch):
+    """As of a mission that was over before; what its search would have learnt was never asked for."""
+    phases = tuple(
+        replace(state, asked_s=jnp.full_like(state.asked_s, jnp.inf).at[1].set(state.asked_s[1])) if asks else state
+        for asks, state in zip([False, True], batch.end.phases, strict=True)
+    )
+    nothing = jax.tree.map(jnp.zeros_like, batch.end.survey)
+    survey = jax.tree.map(lambda zero, known: zero.at[1].set(known[1]), nothing, batch.end.survey)
+    end = replace(batch.end, phases=phases, survey=survey)
+    of = MissionRun(simulation._batches[2], batch.worlds, batch.plans, simulation.plan, SilentProgress())
+    found, asked = of.conclude(end), batch.conclusion
+    assert float(np.asarray(found.survey.map.mean_cps)[0].max()) > 50.0
+    assert bool(np.asarray(found.survey.found)[0])
+    place = np.asarray(found.estimated.fits.position_m)
+    np.testing.assert_allclose(place[:, 0, :2], np.asarray(asked.estimated.fits.position_m)[:, 0, :2], atol=0.3)
+    # what is known of the other one stays as it was
+    np.testing.assert_array_equal(found.survey.map.mean_cps[1], asked.survey.map.rate_cps[1])
 
 
 def test_where_a_counter_was_saturated_no_errors_are_stated(simulation, batch, monkeypatch):

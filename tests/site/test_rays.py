@@ -167,7 +167,7 @@ def test_how_low_the_lower_end_lies():
     for height, expected in ((0.5, 1.0 / 1.0625), (2.0, 0.5), (20.0, 1.0 / 101.0)):
         one, other = jnp.array([0.0, 0.0, 100.0 + height]), jnp.array([30.0, 5.0, 130.0])
         for ends in ((one, other), (other, one)):
-            assert float(crossed(site, *ends).shape.low) == pytest.approx(expected, rel=1e-3)
+            assert float(crossed_of(site, *ends).shape.low) == pytest.approx(expected, rel=1e-3)
 
 
 def test_gradient_equals_difference():
