@@ -159,10 +159,11 @@ class Knowledge(Model):
     """What the mission knows of the world; the rest of the truth is drawn for each mission within these bounds.
 
     ``site``: ``exact``; ``geometry``, with walls up to ``thickness_share`` thinner or thicker than presumed, alike for
-    all of a material, and standing within ``geometry_std_m`` of where they are presumed; ``terrain``, without anything
-    that stands on it; ``none``, a plane. It limits the estimate alone: paths and routes are planned on the true site.
-    Measured places are off by ``pose_std_m`` for each vehicle (RTK), the sensitivity of a detector model by
-    ``sensitivity_std``. ``nuclides`` are those that the estimate considers; identification weighs the whole library.
+    all of a material; ``terrain``, without anything that stands on it; ``none``, a plane. It limits the estimate alone:
+    paths and routes are planned on the true site. Measured places are off by ``pose_std_m`` for each vehicle (RTK), and
+    unless the site is exact by ``geometry_std_m`` for all alike, as its geometry was registered; the sensitivity of a
+    detector model is off by ``sensitivity_std``. ``nuclides`` are those that the estimate considers; identification
+    weighs the whole library.
     The level of the background over its nominal rate is fitted for each detector model, with a flat prior of its
     logarithm. ``background_std`` is how much a background may differ from one window to the next, ``model_std`` what is
     presumed of errors of the model of the rates in a window, and ``spectrum_std`` of each region of its spectrum beside

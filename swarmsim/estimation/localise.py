@@ -57,7 +57,7 @@ class Presumed:
     log_activity: jax.Array  # [] of a source, in Bq
     log_activity_std: jax.Array  # []
     pose_std_m: jax.Array  # [] of measured places
-    place_std_m: jax.Array  # [] error of a source's place that all windows have in common: of poses and walls
+    geometry_std_m: jax.Array  # [] by which all measured places are off from the site's geometry alike; 0: exact
     common_std: jax.Array  # [] of ln(true over modelled rate) of all windows alike: sensitivity, walls not known
     ground_share: jax.Array  # [] of the nominal background, which falls with height
     nuclides: jax.Array  # [N] bool, in question
@@ -177,7 +177,7 @@ def presume(
         log_activity=on_host(np.log(1e6 * knowledge.activity_mbq)),
         log_activity_std=on_host(np.log(knowledge.activity_factor)),
         pose_std_m=on_host(knowledge.pose_std_m),
-        place_std_m=on_host(np.hypot(knowledge.pose_std_m, 0.0 if exact else knowledge.geometry_std_m)),
+        geometry_std_m=on_host(0.0 if exact else knowledge.geometry_std_m),
         common_std=on_host(np.hypot(knowledge.sensitivity_std, BLIND_STD if blind else 0.0)),
         ground_share=on_host(ground_share),
         nuclides=on_host(chosen, bool),
@@ -365,7 +365,9 @@ def _report(
     fits = SourceFits(
         present=s.present,
         position_m=mean[:, :3].at[:, 2].add(height),
-        covariance_m2=in_space + jnp.square(presumed.place_std_m) * jnp.eye(3) + beside,
+        covariance_m2=in_space
+        + (jnp.square(presumed.pose_std_m) + jnp.square(presumed.geometry_std_m)) * jnp.eye(3)
+        + beside,
         activity_bq=activity,
         activity_std_bq=activity * jnp.sqrt(log_variance),
         nuclide=s.nuclide,

@@ -87,8 +87,8 @@ def premises_of(plan: Plan) -> Premises:
 def gathered(world: World, plan: Plan, windows: tuple[Windows | None, ...], key: jax.Array) -> Measurements:
     """Counts of all groups after one another, at the measured places; `Plan.spans` says of which detector models.
 
-    The places of each vehicle are off by the same error throughout, as those of a GNSS receiver with RTK are for
-    minutes; ``key`` is the mission's.
+    The places of each vehicle are off by the same error throughout (`pose_errors`), as those of a GNSS receiver with
+    RTK are for minutes; ``key`` is the mission's.
     """
     assert plan.presumed is not None
     parts = []
@@ -96,18 +96,28 @@ def gathered(world: World, plan: Plan, windows: tuple[Windows | None, ...], key:
         if held is None or group.counter is None:
             continue
         few = merged(held, kept)
-        off = pose_errors(plan.presumed.pose_std_m, key, jnp.asarray(group.member))
+        off = pose_errors(errors_of_places(plan.presumed), key, jnp.asarray(group.member))
         shifted = few.position_m + few.exposure_s[..., None] * off[:, None]
         few = replace(few, position_m=shifted, begin_m=few.begin_m + off[:, None])
         parts.append(measured(few, group.counter.index))
     return concatenate(*parts)
 
 
-def pose_errors(std_m: jax.Array, key: jax.Array, member: jax.Array) -> jax.Array:
-    """Measured less true place [U, 3] (ENU, m) of the vehicles numbered ``member`` [U], in the mission of ``key``."""
+def errors_of_places(presumed: Presumed) -> tuple[jax.Array, jax.Array]:
+    """Standard deviations [] (m) of measured places: of each vehicle's own error, and of that which all have alike."""
+    return presumed.pose_std_m, presumed.geometry_std_m
+
+
+def pose_errors(std_m: tuple[jax.Array, jax.Array], key: jax.Array, member: jax.Array) -> jax.Array:
+    """Measured less true place [U, 3] (ENU, m) of the vehicles numbered ``member`` [U], in the mission of ``key``.
+
+    Each vehicle has an error of its own, and all have that in common by which the geometry of the site, which places
+    are told in, was registered wrongly (``std_m``: `errors_of_places`).
+    """
+    of_each, of_all = std_m
     keys = randomness.per_vehicle(randomness.consumer(key, "pose"), jnp.int32(0), member)
-    errors: jax.Array = std_m * jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
-    return errors
+    own: jax.Array = of_each * jax.vmap(lambda k: jax.random.normal(k, (3,)))(keys)
+    return own + of_all * jax.random.normal(randomness.consumer(key, "registration"), (3,))
 
 
 @pytree

@@ -1,6 +1,7 @@
 """What was drawn for a mission within the bounds of its knowledge: the truth that its estimate does not know."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +16,13 @@ from swarmsim.world.build import detector_models
 from swarmsim.world.model import World
 
 
-def departures_of(simulation: Simulation, world: World, pose_std_m: np.ndarray | None, seed: int) -> Departures | None:
+def departures_of(
+    simulation: Simulation, world: World, pose_std_m: tuple[Any, Any] | None, seed: int
+) -> Departures | None:
     """The departures of the mission of a ``seed`` with its own ``world``; None where no vehicle has a detector.
 
-    They are drawn again, by the functions and from the key that the mission drew them with. ``pose_std_m`` [] is None
-    where no source is estimated, which alone asks for measured places.
+    They are drawn again, by the functions and from the key that the mission drew them with. ``pose_std_m``
+    (`errors_of_places`) is None where no source is estimated, which alone asks for measured places.
     """
     counting = [np.asarray(group.member) for group in world.groups if group.counter is not None]
     if not counting:
@@ -28,9 +31,9 @@ def departures_of(simulation: Simulation, world: World, pose_std_m: np.ndarray |
     measured = [] if pose_std_m is None else counting
     numbers = np.sort(np.concatenate([np.zeros(0, np.int32), *measured])).astype(np.int32)
     key = randomness.mission_keys(np.array([seed]))[0]
-    std_m = jnp.zeros(()) if pose_std_m is None else jnp.asarray(pose_std_m)
-    drawn = _drawn(world.departures, key, std_m, jnp.asarray(numbers), len(models))
-    lengths, sensitivities, errors = jax.device_get(drawn)
+    lengths, sensitivities = jax.device_get(_drawn(world.departures, key, len(models)))
+    std_m = (0.0, 0.0) if pose_std_m is None else pose_std_m
+    errors = np.asarray(_pose_errors(std_m, key, jnp.asarray(numbers)))
     site = world.site
     solid = np.all(np.asarray(site.obstacles.half_extent_m) > 0.0, axis=1)
     materials = sorted(set(np.asarray(site.obstacles.material)[solid].tolist()))
@@ -42,10 +45,11 @@ def departures_of(simulation: Simulation, world: World, pose_std_m: np.ndarray |
     )
 
 
-@partial(jax.jit, static_argnums=4)
-def _drawn(
-    within: radiation.Departures, key: jax.Array, pose_std_m: jax.Array, numbers: jax.Array, models: int
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Length factors [M], sensitivity factors [D] and pose errors [U, 3] of one mission."""
+_pose_errors = jax.jit(pose_errors)
+
+
+@partial(jax.jit, static_argnums=2)
+def _drawn(within: radiation.Departures, key: jax.Array, models: int) -> tuple[jax.Array, jax.Array]:
+    """Length factors [M] and sensitivity factors [D] of one mission."""
     sensitivities = jnp.stack([radiation.sensitivity_factor(within, key, model) for model in range(models)])
-    return radiation.length_factors(within, key), sensitivities, pose_errors(pose_std_m, key, numbers)
+    return radiation.length_factors(within, key), sensitivities

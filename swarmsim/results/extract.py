@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from swarmsim.config.errors import InputError
+from swarmsim.missions.knowledge import errors_of_places
 from swarmsim.missions.state import MissionState
 from swarmsim.results.answer import answer_of
 from swarmsim.results.departures import departures_of
@@ -36,7 +37,9 @@ def mission_record(simulation: Simulation, batch: MissionBatch, index: int) -> M
     tracks = [_tracks(batch, index, group) for group in range(len(simulation.world.groups))]
     vehicles = [_vehicle(simulation, tracks, end, number) for number in range(len(simulation.scenario.members))]
     world = batch.worlds.of(index)
-    pose_std_m = batch.plans.part(index, lambda plan: None if plan.presumed is None else plan.presumed.pose_std_m)
+    pose_std_m = batch.plans.part(
+        index, lambda plan: None if plan.presumed is None else errors_of_places(plan.presumed)
+    )
     sources = true_sources(simulation, world, vehicles)
     samples = _samples(simulation, batch, index, phases)
     events = sorted(_events(simulation, end, phases), key=lambda event: event.time_s)

@@ -73,7 +73,9 @@ def test_expected_counts_give_the_truth_back(localiser):
 
 def test_a_known_height_stays_fixed(localiser):
     none = jnp.float32(0.0)  # poses have no error, which would move the source with them
-    fixed = replace(localiser.presumed, height_m=jnp.float32(0.5), height_std_m=none, place_std_m=none)
+    fixed = replace(
+        localiser.presumed, height_m=jnp.float32(0.5), height_std_m=none, pose_std_m=none, geometry_std_m=none
+    )
     fits = localiser(counted(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, CO_60)), fixed).fits
     np.testing.assert_allclose(fits.position_m[0, 2], 0.5, atol=0.01)
     assert float(fits.covariance_m2[0, 2, 2]) < 1e-5

@@ -9,7 +9,7 @@ import pytest
 
 import swarmsim
 from swarmsim.estimation.windows import windows_start
-from swarmsim.missions.knowledge import expected_spectrum, gathered
+from swarmsim.missions.knowledge import errors_of_places, expected_spectrum, gathered, pose_errors
 from swarmsim.results.departures import departures_of
 from swarmsim.results.record import Departures
 from swarmsim.runtime.simulation import Simulation
@@ -24,7 +24,7 @@ def simulation() -> Simulation:
 
 def departures(simulation: Simulation, seed: int = SEED) -> Departures:
     assert simulation.plan.presumed is not None
-    made = departures_of(simulation, simulation.world, np.asarray(simulation.plan.presumed.pose_std_m), seed)
+    made = departures_of(simulation, simulation.world, errors_of_places(simulation.plan.presumed), seed)
     assert made is not None
     return made
 
@@ -53,6 +53,18 @@ def test_pose_errors_are_what_the_estimate_has_in_its_places(simulation):
     measurements = gathered(world, plan, tuple(windows), key)  # of crystals at the origin
     shown = {tuple(np.round(row, 6)) for row in np.asarray(measurements.position_m) if np.any(row)}
     assert {tuple(np.round(error, 6)) for error in departures(simulation).pose_error_m.values()} == shown
+
+
+def test_vehicles_have_the_error_of_the_geometry_in_common(simulation):
+    """Each its own as well: by as much as the stated covariance of a source's place has of both."""
+    std_m = errors_of_places(simulation.plan.presumed)
+    keys = jax.vmap(jax.random.key)(jnp.arange(4000))
+    errors = np.asarray(jax.jit(jax.vmap(lambda key: pose_errors(std_m, key, jnp.arange(2))))(keys))
+    covariance = np.cov(errors.reshape(4000, 6).T)
+    own, alike = (float(std) ** 2 for std in std_m)
+    assert alike == pytest.approx(0.05**2)
+    expected = np.kron(np.array([[alike + own, alike], [alike, alike + own]]), np.eye(3))
+    np.testing.assert_allclose(covariance, expected, atol=0.07 * alike)
 
 
 def test_the_sensitivity_is_what_counts_have(simulation):
