@@ -178,9 +178,8 @@ class Departures:
 
     thickness_factor: Mapping[str, float]  # true over presumed thickness of what stands there, by material
     sensitivity_factor: Mapping[str, float]  # true over presumed sensitivity, by detector model
-    pose_error_m: Mapping[
-        str, Floats
-    ]  # [3] measured less true place (ENU), by vehicle; none where nothing is estimated
+    # [3] measured less true place (ENU), by vehicle, with what all have in common; none where nothing is estimated
+    pose_error_m: Mapping[str, Floats]
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,8 @@ def departures_summary(record: MissionRecord) -> dict[str, dict[str, Any]] | Non
 
     ``thickness_factor``: true over presumed thickness, by material of the walls (none where walls are presumed exactly
     or not at all). ``sensitivity_factor``: true over presumed sensitivity, by detector model. ``pose_error_m``:
-    measured less true place (east, north, up) by vehicle, the same throughout; it is in what the estimate of sources
+    measured less true place (east, north, up) by vehicle, the same throughout, with the error of the site's geometry
+    that all have in common; it is in what the estimate of sources
     works on (none without one), and not in the places of ``measurements.parquet``, which are true.
     """
     made = record.departures
