@@ -147,7 +147,7 @@ def test_where_the_search_never_began_the_counts_are_still_looked_at(simulation,
     place = np.asarray(found.estimated.fits.position_m)
     np.testing.assert_allclose(place[:, 0, :2], np.asarray(asked.estimated.fits.position_m)[:, 0, :2], atol=0.3)
     # what is known of the other one stays as it was
-    np.testing.assert_array_equal(found.survey.map.mean_cps[1], asked.survey.map.rate_cps[1])
+    np.testing.assert_array_equal(found.survey.map.mean_cps[1], asked.survey.map.mean_cps[1])
 
 
 def test_where_a_counter_was_saturated_no_errors_are_stated(simulation, batch, monkeypatch):
