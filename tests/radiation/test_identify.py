@@ -16,6 +16,8 @@ from swarmsim.radiation.rate import end_on, mean_view
 from swarmsim.radiation.templates import shielded, thickness_m
 from tests.radiation.points import MOUNT, point, through
 
+pytestmark = pytest.mark.optimised
+
 UP, PLACE = jnp.array([0.0, 0.0, 1.0]), jnp.array([0.0, 0.0, 5.0])
 LIVE_S = 60.0
 Detectors = dict[tuple[str, str], Detector]
