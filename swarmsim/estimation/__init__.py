@@ -9,13 +9,12 @@ from swarmsim.estimation.likelihood import cramer_rao_covariance, fisher_informa
 from swarmsim.estimation.localise import (
     Estimated,
     LocalisationParams,
-    Presumed,
     SourceFits,
     localisation_params,
     localise,
-    presume,
 )
 from swarmsim.estimation.measurements import Measurements, aggregate, concatenate
+from swarmsim.estimation.presumed import Presumed, presume
 from swarmsim.estimation.radiation_map import MappingParams, RadiationMap, interpolate, mapping_params
 
 __all__ = [

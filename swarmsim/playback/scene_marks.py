@@ -128,7 +128,7 @@ def _estimate(stream: rr.RecordingStream, path: str, estimate: Estimate, name: s
     _pin(stream, path, estimate.position_m, 15.0, label, colour, static=False)
 
 
-def _in_cps(rate_cps: float) -> str:
+def in_cps(rate_cps: float) -> str:
     """A count rate in words, with three digits at least: a Geiger counter shows a few counts a second."""
     return f"{rate_cps:.0f} cps" if rate_cps >= 100.0 else f"{rate_cps:.3g} cps"
 
@@ -179,7 +179,7 @@ def send_legend(
                 centres[[0, -1]],
                 radii=rr.Radius.ui_points(0.5),
                 colors=[_LABEL],
-                labels=[f"{_legend_title(record, name)}: {_in_cps(rates[0])}", _in_cps(rates[-1])],
+                labels=[f"{_legend_title(record, name)}: {in_cps(rates[0])}", in_cps(rates[-1])],
                 show_labels=True,
             ),
             static=True,

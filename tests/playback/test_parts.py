@@ -12,7 +12,9 @@ from swarmsim.config.errors import InputError
 from swarmsim.playback import growing_map, viewer
 from swarmsim.playback.bodies import shaded, vehicle_mesh
 from swarmsim.playback.colours import linear_scale, log_scale, smoothed_rate, vehicle_colours
-from swarmsim.playback.scene_marks import ellipsoid, quaternion_of
+from swarmsim.playback.scene_marks import ellipsoid, in_cps, quaternion_of
+from swarmsim.playback.story import describe
+from swarmsim.results.finding import told_activity
 from swarmsim.results.record import MissionRecord, Samples
 from swarmsim.site.model import SiteModel
 from tests import synthetic
@@ -38,6 +40,21 @@ def test_smoothed_rate_lowers_the_noise_as_poisson_says(found: MissionRecord) ->
     error = smoothed_rate(survey) - synthetic.rate_cps(survey.position_m)
     raw = survey.count_rate_cps - synthetic.rate_cps(survey.position_m)
     assert error.std() / raw.std() == pytest.approx(1 / np.sqrt(11), rel=0.25)
+
+
+@pytest.mark.parametrize(
+    ("rate", "said"), [(0.314, "0.314 cps"), (2.5, "2.5 cps"), (94.06, "94.1 cps"), (12345.6, "12346 cps")]
+)
+def test_a_slow_counter_does_not_show_zero(rate: float, said: str) -> None:
+    assert in_cps(rate) == said
+
+
+def test_the_log_tells_a_faint_source_with_its_standard_deviation_where_it_is_known(found: MissionRecord) -> None:
+    assert found.estimate is not None
+    faint = dataclasses.replace(found.estimate, nuclide="Co-60", activity_mbq=0.0312, activity_std_mbq=0.0041)
+    assert describe(faint).endswith(" m up, 0.0312 ± 0.0041 MBq Co-60")
+    assert describe(dataclasses.replace(faint, errors_known=False)).endswith(" m up, about 0.031 MBq Co-60")
+    assert told_activity(dataclasses.replace(faint, errors_known=False)) == "0.031 MBq"
 
 
 @pytest.mark.parametrize("scale_of", [linear_scale, log_scale])
