@@ -36,6 +36,7 @@ class Problem:
     model_std: jax.Array  # [] of a window's ln(true over modelled rate of the sources)
     tail: jax.Array  # [] degrees of freedom of the distribution (Student's t) of a window's rate
     pose_std_m: jax.Array  # [n] of a window's place
+    geometry_std_m: jax.Array  # [] by which all places are off from the site's geometry alike
     log_activity: jax.Array  # [] prior of ln(activity in Bq), its mean
     log_activity_std: jax.Array  # []
     learning_rate: jax.Array  # [] 0..1: how often the log likelihood counts in the posterior of a place
@@ -67,11 +68,16 @@ class Ways:
 
 
 @jax.jit  # traced once for all places of a program that call it
-def ways_from(problem: Problem, place: jax.Array) -> Ways:
-    """What lies between ``place`` [3] (x, y, height above the ground) and the windows."""
+def ways_from(problem: Problem, place: jax.Array, off_m: jax.Array | None = None) -> Ways:
+    """What lies between ``place`` [3] (x, y, height above the ground) and the windows.
+
+    Both the place and those of the windows may be off from the site's geometry by ``off_m`` [3].
+    """
     position, valid = position_of(problem.site, place), problem.measurements.valid
     wanted = jnp.concatenate([jnp.repeat(valid[first:last], rays) for first, last, _, rays in problem.spans])
-    crossed = crossed_from(problem.site, position, problem.nodes.position_m, wanted)
+    ends = position, problem.nodes.position_m
+    one, other = ends if off_m is None else (x - off_m for x in ends)
+    crossed = crossed_from(problem.site, one, other, wanted)
     return Ways(crossed=crossed, position_m=position)
 
 

@@ -31,6 +31,8 @@ from swarmsim.pytree import pytree
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
 # "The unreasonable effectiveness of quasirandom sequences", 2018).
 _EVEN = (0.8191725, 0.6710436, 0.5497005)
+# of what all places are off by: the last three of six dimensions, of the root of x^7 = x + 1
+_EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
 FIRST_SCALES = (4.2, 2.0, 2.0, 1.0)  # standard deviations of the first round, in turn, over those that are promised
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 ABOUT_MEAN = 3  # so many of the scales are about the mean, to see the tails. The others are about likely places.
@@ -41,6 +43,8 @@ LEAST_EFFECTIVE = 16.0  # and as this many for the moments
 ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
 LEAST_ROUNDS = 5
 LEAST_STD_M = 1e-3
+OFF_WIDER = 1.2  # standard deviations of the error of all places that are drawn, over those so far
+LEAST_OFF = 0.2  # of its prior's
 LEAST_SHARE = 1e-3  # standard deviation of a round in any direction, over that in all: two places far apart span one
 
 
@@ -66,36 +70,55 @@ class Posterior:
 
 
 @pytree
+class _Normals:
+    """Normal distributions of places, and of the error of all places over the standard deviation of its prior."""
+
+    centres: jax.Array  # [..., 3]
+    inverse: jax.Array  # [..., 3, 3] of the lower triangular root of the covariance
+    off: jax.Array  # [..., 3]
+    off_std: jax.Array  # [..., 3]
+
+
+@pytree
 class _Rounds:
     """Places weighed so far, and the distributions that they were drawn from; Q rounds of P places."""
 
     known: Weighed  # [Q, P]
-    centres: jax.Array  # [Q, P, 3]
-    inverse: jax.Array  # [Q, P, 3, 3] of the lower triangular root of the covariance
+    off: jax.Array  # [Q, P, 3] error of all places, over the standard deviation of its prior
+    drawn_from: _Normals  # [Q, P]
     mixture: jax.Array  # [Q, P] log density of all distributions together
     count: jax.Array  # [] int32 rounds done
 
 
 def sample_posterior(
-    weigh: Callable[[jax.Array], Weighed],
+    weigh: Callable[[jax.Array, jax.Array], Weighed],
     start: jax.Array,
     covariance: jax.Array,
     rounds: int,
     per_round: int,
     others: jax.Array | None = None,
     pivot: jax.Array | None = None,
+    off_std_m: jax.Array | float = 0.0,
 ) -> Posterior:
     """Moments of the posterior around ``start`` [3], whose covariance near it is about ``covariance`` [3, 3].
 
-    ``weigh`` gives the posterior at a place [3]. There are ``rounds`` of ``per_round`` places at most. Half of the
-    first ones lie about ``others`` [m, 3], in turn, where there may be further modes. What is likely may lie around
-    ``pivot`` [3] on a ring; without one there is none, and ridges are taken to be straight.
+    All places are told with one unknown error [3], which in each direction is normal of ``off_std_m`` []: the moments
+    are those of the place less it.
+
+    Args:
+        weigh: gives the posterior at a place [3], by what it is off [3].
+        start: [3] a likely place.
+        covariance: [3, 3] about that of the posterior near it.
+        rounds: at most (static).
+        per_round: places in a round (static).
+        others: [m, 3] places about which half of the first ones lie, in turn, where there may be further modes.
+        pivot: [3] around which what is likely may lie on a ring; without one ridges are taken to be straight.
+        off_std_m: [] standard deviation of the error.
     """
     index = jnp.arange(per_round)
     starts = start if others is None else jnp.where((index % 2)[:, None], others[index // 2 % len(others)], start)
-    even = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(_EVEN), 1.0)
-    normal = jax.scipy.special.ndtri(jnp.clip(even, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
-    local = index % len(SCALES) >= ABOUT_MEAN
+    normal, normal_off = _normal(rounds, per_round, _EVEN), _normal(rounds, per_round, _EVEN_OFF)
+    local, adapted = index % len(SCALES) >= ABOUT_MEAN, (index % 2 == 1) & (jnp.asarray(off_std_m) > 0.0)
 
     def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
         """Centres [P, 3] and covariances [P, 3, 3] of the next round."""
@@ -110,15 +133,38 @@ def sample_posterior(
     def round_(done: _Rounds) -> _Rounds:
         centres, covariances = placed(done)
         roots = jnp.linalg.cholesky(covariances + _least(covariances))
-        drawn = each(weigh, centres + jnp.einsum("pij,pj->pi", roots, normal[done.count]), TOGETHER)
-        return _with_round(done, drawn, centres, roots)
+        eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
+        inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
+        mean, std = _of_off(done, adapted)
+        drawn_from = _Normals(centres=centres, inverse=inverse, off=mean, off_std=std)
+        places = centres + jnp.einsum("pij,pj->pi", roots, normal[done.count])
+        off = mean + std * normal_off[done.count]
+        drawn = each(lambda x: weigh(*x), (places, off_std_m * off), TOGETHER)
+        return _with_round(done, drawn, off, drawn_from)
 
     def more(done: _Rounds) -> jax.Array:
         enough = _worth(done) >= ENOUGH_EFFECTIVE
         return (done.count < rounds) & ~(enough & (done.count >= LEAST_ROUNDS))
 
     done = repeat_while(more, round_, _nowhere(rounds, per_round))
-    return _summary(done)
+    return _summary(done, off_std_m)
+
+
+def _of_off(done: _Rounds, adapted: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Means and standard deviations [P, 3] of the error of all places in the next round.
+
+    Those of its prior, but for the ``adapted`` [P] those that were likely so far.
+    """
+    mean, covariance = _moments(done.off, flattened(_log_weights(done), PLACED_EFFECTIVE))
+    std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0.0)), LEAST_OFF, 1.0)
+    now = (adapted & _any_weight(done))[:, None]
+    return jnp.where(now, mean, 0.0), jnp.where(now, std, 1.0)
+
+
+def _normal(rounds: int, per_round: int, even: tuple[float, ...]) -> jax.Array:
+    """Standard normal numbers [rounds, per_round, 3] that fill space evenly."""
+    share = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(even), 1.0)
+    return jax.scipy.special.ndtri(jnp.clip(share, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
 
 
 def _least(covariance: jax.Array) -> jax.Array:
@@ -137,10 +183,11 @@ def _nowhere(rounds: int, per_round: int) -> _Rounds:
         log_posterior=jnp.full((rounds, per_round), -jnp.inf),
         information=eye,
     )
+    places = empty.place
     return _Rounds(
         known=empty,
-        centres=empty.place,
-        inverse=eye,
+        off=places,
+        drawn_from=_Normals(centres=places, inverse=eye, off=places, off_std=jnp.ones_like(places)),
         mixture=empty.log_posterior,
         count=jnp.int32(0),
     )
@@ -198,10 +245,10 @@ def _turned(
     return pivot + jnp.einsum("ijp,pj->pi", turn, offset), jnp.einsum("ijp,pjk,lkp->pil", turn, covariances, turn)
 
 
-def _summary(done: _Rounds) -> Posterior:
+def _summary(done: _Rounds, off_std_m: jax.Array | float) -> Posterior:
     known, log_weights = done.known, _log_weights(done)
     weight = flattened(log_weights, LEAST_EFFECTIVE)
-    values = jnp.concatenate([known.place, known.log_activity[..., None]], axis=-1)
+    values = jnp.concatenate([known.place - off_std_m * done.off, known.log_activity[..., None]], axis=-1)
     mean, covariance = _moments(values, weight)
     covariance = covariance.at[3, 3].add(jnp.sum(jnp.where(weight > 0.0, weight * known.variance, 0.0)))
     return Posterior(
@@ -235,50 +282,48 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, dr
     return jnp.max(apart)
 
 
-def _with_round(done: _Rounds, drawn: Weighed, centres: jax.Array, roots: jax.Array) -> _Rounds:
-    """The rounds and one more: places [P], and the normal distributions that they were drawn from.
-
-    ``centres`` [P, 3] and lower triangular ``roots`` [P, 3, 3] of the covariances.
-    """
+def _with_round(done: _Rounds, drawn: Weighed, off: jax.Array, drawn_from: _Normals) -> _Rounds:
+    """The rounds and one more: places [P], the error [P, 3] of all places, and what both were drawn from [P]."""
     k = done.count
-    known = jax.tree.map(lambda all_, new: all_.at[k].set(new), done.known, drawn)
-    eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
-    inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
+    known, every, all_off = (
+        jax.tree.map(lambda all_, new: all_.at[k].set(new), *x)
+        for x in ((done.known, drawn), (done.drawn_from, drawn_from), (done.off, off))
+    )
     # the new distributions at all places, and those before them at the new places: the rest is known
     places = known.place.reshape(-1, 3)
-    of_new = _log_density(places, places[0], centres, inverse).reshape(known.log_posterior.shape)
-    earlier = jnp.repeat(jnp.arange(len(done.centres)) < k, len(centres))
-    before = _log_density(
-        drawn.place, places[0], done.centres.reshape(-1, 3), done.inverse.reshape(-1, 3, 3), earlier
-    )  # fmt: skip
+    of_new = _log_density(places, all_off.reshape(-1, 3), places[0], drawn_from).reshape(known.log_posterior.shape)
+    earlier = jnp.repeat(jnp.arange(len(done.off)) < k, len(off))
+    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), done.drawn_from)
+    before = _log_density(drawn.place, off, places[0], flat, earlier)
     mixture = done.mixture.at[k].set(before)
     return _Rounds(
         known=known,
-        centres=done.centres.at[k].set(centres),
-        inverse=done.inverse.at[k].set(inverse),
+        off=all_off,
+        drawn_from=every,
         mixture=jnp.logaddexp(mixture, of_new),
         count=k + 1,
     )
 
 
 def _log_density(
-    places: jax.Array, origin: jax.Array, centres: jax.Array, inverse: jax.Array, drawn: jax.Array | bool = True
+    places: jax.Array, off: jax.Array, origin: jax.Array, of: _Normals, drawn: jax.Array | bool = True
 ) -> jax.Array:
-    """Log density [m] at ``places`` [m, 3] of the normal distributions that are ``drawn`` [n] from, up to a constant.
+    """Log density [m] at ``places`` [m, 3] that are ``off`` [m, 3], of those of [n] that are ``drawn`` [n] from.
 
-    Those and the ``centres`` [n, 3] are taken relative to ``origin`` [3]: large coordinates would lose digits in
-    float32. ``inverse`` [n, 3, 3] are those of the roots.
+    Up to a constant. Places and centres are taken relative to ``origin`` [3]: large coordinates would lose digits in
+    float32.
     """
-    offset = (places - origin)[:, None] - (centres - origin)
-    turned = [sum(inverse[:, i, j] * offset[..., j] for j in range(i + 1)) for i in range(3)]
-    sharp = jnp.sum(jnp.log(jnp.diagonal(inverse, axis1=1, axis2=2)), axis=1)
+    offset = (places - origin)[:, None] - (of.centres - origin)
+    turned = [sum(of.inverse[:, i, j] * offset[..., j] for j in range(i + 1)) for i in range(3)]
+    turned += [(off[:, i, None] - of.off[:, i]) / of.off_std[:, i] for i in range(3)]
+    sharp = jnp.sum(jnp.log(jnp.diagonal(of.inverse, axis1=1, axis2=2)) - jnp.log(of.off_std), axis=1)
     each_ = sharp - 0.5 * sum(jnp.square(x) for x in turned)
     return jax.scipy.special.logsumexp(jnp.where(drawn, each_, -jnp.inf), axis=1)
 
 
 def _log_weights(done: _Rounds) -> jax.Array:
     """Logarithms [Q, P] of posterior over mixture of the distributions of all rounds so far."""
-    weight = done.known.log_posterior - done.mixture
+    weight = done.known.log_posterior - 0.5 * jnp.sum(jnp.square(done.off), axis=-1) - done.mixture
     return jnp.where(jnp.isfinite(weight), weight, -jnp.inf)
 
 

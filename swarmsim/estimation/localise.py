@@ -127,6 +127,7 @@ def problem_of(presumed: Presumed, measurements: Measurements, spans: tuple[Span
         log_activity=jnp.asarray(presumed.log_activity),
         log_activity_std=jnp.asarray(presumed.log_activity_std),
         pose_std_m=jnp.sqrt(jnp.square(presumed.pose_std_m) + WAY_SHARE**2 * travel),
+        geometry_std_m=jnp.asarray(presumed.geometry_std_m),
         height_m=jnp.asarray(presumed.height_m),
         height_std_m=jnp.asarray(presumed.height_std_m),
         detector=detector,
@@ -251,9 +252,7 @@ def _report(
     fits = SourceFits(
         present=s.present,
         position_m=mean[:, :3].at[:, 2].add(height),
-        covariance_m2=in_space
-        + (jnp.square(presumed.pose_std_m) + jnp.square(presumed.geometry_std_m)) * jnp.eye(3)
-        + beside,
+        covariance_m2=in_space + jnp.square(presumed.pose_std_m) * jnp.eye(3) + beside,
         activity_bq=activity,
         activity_std_bq=activity * jnp.sqrt(log_variance),
         nuclide=s.nuclide,

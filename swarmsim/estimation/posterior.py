@@ -122,8 +122,8 @@ def _posterior(
     known = 12.0 / jnp.square(limits[1] - limits[0])  # uniform over the site
     known = known.at[2].set(height_precision(problem.height_std_m))
 
-    def weigh(place: jax.Array) -> Weighed:
-        fit = settle(problem, ways_from(problem, place), nuclide, others, u, WEIGH_STEPS, exact=False)
+    def weigh(place: jax.Array, off_m: jax.Array) -> Weighed:
+        fit = settle(problem, ways_from(problem, place, off_m), nuclide, others, u, WEIGH_STEPS, exact=False)
         of_height = 0.5 * height_precision(problem.height_std_m) * jnp.square(place[2] - problem.height_m)
         inside = jnp.all((place >= limits[0]) & (place <= limits[1]))
         return Weighed(
@@ -137,7 +137,8 @@ def _posterior(
     covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
     modes, beside = some_at_a_time(lambda: _around(problem, state, k, others, u))
     pivot = heard_most_at(problem, s.place[k], jnp.sum(state.added.counts[k], axis=1))
-    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, modes, pivot), beside
+    off = problem.geometry_std_m
+    return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, modes, pivot, off), beside
 
 
 def _around(

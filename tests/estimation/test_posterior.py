@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
@@ -17,6 +17,7 @@ from swarmsim.estimation.importance_sampling import (
     FIRST_SCALES,
     Weighed,
     _log_weights,
+    _Normals,
     _Rounds,
     _with_round,
     _worth,
@@ -43,11 +44,40 @@ def weighed(place, log_posterior, log_activity=0.0, variance=0.0):
 
 
 @jax.jit
+def _of_two_normals(mean, covariance, site, start, guess, off_std):
+    """Moments where places that are off are normal, and so are what walls tell of where they are on the site."""
+    inverse, wall = jnp.linalg.inv(covariance), jnp.linalg.inv(site)
+
+    def weigh(x, off):
+        from_mean, from_walls = x - mean, x - off - mean
+        told = from_mean @ inverse @ from_mean + from_walls @ wall @ from_walls
+        return replace(weighed(x, -0.5 * told), information=inverse + wall)
+
+    return sample_posterior(weigh, start, guess, 24, 24, off_std_m=off_std)
+
+
+@pytest.mark.parametrize("walls_m", [1e4, 0.1, 0.02])
+def test_what_all_places_are_off_by_is_told_by_walls_alone(walls_m):
+    """A place known to 3 cm by distances, on a site registered to 5 cm: the sum of both where walls tell nothing."""
+    mean, off_std = np.array([20.0, -30.0, 1.0]), 0.05
+    covariance, site = np.diag(np.square([0.03, 0.02, 0.05])), walls_m**2 * np.eye(3)
+    f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    start = mean + np.array([0.03, 0.0, 0.05])
+    found = _of_two_normals(*map(f32, (mean, covariance, site, start, covariance, off_std)))
+    # place p = x - off with x ~ N(0, C) and off ~ N(0, s^2) before walls tell p ~ N(0, W)
+    expected = np.linalg.inv(np.linalg.inv(covariance + off_std**2 * np.eye(3)) + np.linalg.inv(site))
+    std = np.sqrt(np.diag(expected))
+    assert np.all(np.abs(np.asarray(found.mean)[:3] - mean) < 0.35 * std)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)[:3]), std, rtol=0.2)
+    assert float(found.effective) >= 40.0
+
+
+@jax.jit
 def _of_a_normal(mean, covariance, slope, variance, start, guess):
     """Moments where the posterior of the place is normal, and the activity's logarithm linear in the place."""
     inverse = jnp.linalg.inv(covariance)
 
-    def weigh(x):
+    def weigh(x, _):
         offset = x - mean
         return Weighed(
             place=x, log_activity=slope @ offset, variance=variance, log_posterior=-0.5 * offset @ inverse @ offset,
@@ -82,7 +112,7 @@ def test_rounds_close_in_on_what_is_much_narrower_than_promised():
     mean, std = np.array([1.0, 2.0, 0.5]), np.array([0.25, 0.35, 0.2])
     zero = jnp.zeros(())
 
-    def weigh(place):
+    def weigh(place, _):
         off = (place - mean) / std
         value = -0.5 * jnp.sum(jnp.square(off))
         return Weighed(place=place, log_activity=zero, variance=zero, log_posterior=value, information=promised)
@@ -101,7 +131,7 @@ def _of_a_ring(start, pivot, radius, width):
     """Moments where all places at a distance from the pivot are likely, of a source about 1 m high."""
     height = 1.0 / 0.4**2
 
-    def weigh(x):
+    def weigh(x, _):
         offset = x - pivot
         far = jnp.linalg.norm(offset)
         value = -0.5 * jnp.square((far - radius) / width) - 0.5 * height * jnp.square(x[2] - 1.0)
@@ -109,7 +139,7 @@ def _of_a_ring(start, pivot, radius, width):
         information = jnp.outer(along, along) / jnp.square(width) + jnp.diag(jnp.array([1e-4, 1e-4, height]))
         return replace(weighed(x, value), information=information)
 
-    promised = jnp.linalg.inv(weigh(start).information)
+    promised = jnp.linalg.inv(weigh(start, None).information)
     return sample_posterior(weigh, start, promised, 16, 24, None, pivot)
 
 
@@ -131,7 +161,7 @@ def test_a_ring_is_sampled_all_around():
 def test_two_halves_that_disagree_are_told():
     """All of the posterior in a hair's breadth far from the start: the few places that come near it settle nothing."""
 
-    def weigh(x):
+    def weigh(x, _):
         far = -0.5 * jnp.sum(jnp.square((x - 2.5) / 0.02))
         return weighed(x, far, x[0], jnp.float32(0.01))
 
@@ -143,7 +173,7 @@ def two_modes(turn):
     """A posterior [] of places with one mode at the origin, and less of another one six metres from it."""
     other = 6.0 * jnp.stack([jnp.cos(turn), jnp.sin(turn), 0.0 * turn])
 
-    def weigh(x):
+    def weigh(x, _):
         modes = jnp.stack([-0.5 * jnp.sum(x * x) + jnp.log(0.7), -0.5 * jnp.sum(jnp.square(x - other)) + jnp.log(0.3)])
         return weighed(x, jax.scipy.special.logsumexp(modes))
 
@@ -169,7 +199,9 @@ def test_a_few_places_that_outweigh_all_others_are_not_worth_many():
     zero = jnp.zeros((40, 24))
     eye = jnp.broadcast_to(jnp.eye(3), (40, 24, 3, 3))
     known = replace(weighed(jnp.zeros((40, 24, 3)), jnp.float32(value), zero, zero), information=eye)
-    done = _Rounds(known=known, centres=known.place, inverse=eye, mixture=zero, count=jnp.int32(5))
+    off = jnp.zeros((40, 24, 3))
+    drawn_from = _Normals(centres=known.place, inverse=eye, off=off, off_std=off + 1.0)
+    done = _Rounds(known=known, off=off, drawn_from=drawn_from, mixture=zero, count=jnp.int32(5))
     assert float(_worth(done)) < 5.0
 
 
@@ -179,7 +211,7 @@ def _of_two_places(turn):
     """A posterior that only the two of the first places farthest to either side of a line reach."""
     across = jnp.stack([jnp.cos(turn), jnp.sin(turn), 0.0 * turn])
 
-    def weigh(x):
+    def weigh(x, _):
         far = jnp.abs(x @ across) > 25.0
         return weighed(x, jnp.where(far, 0.0, -jnp.inf))
 
@@ -317,7 +349,7 @@ def test_a_posterior_of_which_no_place_was_found_is_worth_nothing(none):
     """It is sought about the start all the time, and no place counts as one of the posterior."""
     start = jnp.array([50.0, 60.0, 1.0])
 
-    def weigh(x):
+    def weigh(x, _):
         return weighed(x, jnp.float32(none), x[0], jnp.float32(0.01))
 
     found = jax.jit(lambda: sample_posterior(weigh, start, jnp.eye(3), 6, 40))()
@@ -326,7 +358,7 @@ def test_a_posterior_of_which_no_place_was_found_is_worth_nothing(none):
 
 
 def test_a_place_without_weight_may_have_any_values():
-    def weigh(x):
+    def weigh(x, _):
         there = x[0] > 0.3
         return Weighed(
             place=x, log_activity=jnp.where(there, x[0], jnp.nan), variance=jnp.where(there, 0.01, jnp.inf),
@@ -374,10 +406,10 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
     none = jnp.zeros((rounds, per_round))
     eye = jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
     empty = replace(weighed(jnp.zeros((rounds, per_round, 3)), none - jnp.inf, none, none), information=eye)
-    done = _Rounds(
-        known=empty, centres=empty.place, inverse=eye, mixture=none - jnp.inf, count=jnp.int32(0)
-    )  # fmt: skip
-    places, centres, roots = [], [], []
+    zero = empty.place
+    nothing = _Normals(centres=zero, inverse=eye, off=zero, off_std=zero + 1.0)
+    done = _Rounds(known=empty, off=zero, drawn_from=nothing, mixture=none - jnp.inf, count=jnp.int32(0))
+    places, centres, roots, offs, off_means, off_stds = [], [], [], [], [], []
     for _ in range(drawn):
         # far from the origin of the site, and from one round to the next
         centres.append((rng.normal(size=(per_round, 3)) * 2.0 + [3000.0, -2000.0, 1.0]).astype(np.float32))
@@ -385,12 +417,18 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
         roots.append((rng.choice([0.6, 1.2, 2.5], (per_round, 1, 1)) * lower).astype(np.float32))
         places.append((centres[-1] + rng.normal(size=(per_round, 3))).astype(np.float32))
         new = replace(weighed(jnp.asarray(places[-1]), none[0] + 1.0, none[0], none[0]), information=eye[0])
-        done = _with_round(done, new, jnp.asarray(centres[-1]), jnp.asarray(roots[-1]))
-    at = np.concatenate(places).astype(np.float64)
+        offs, off_means = ([*x, rng.normal(size=(per_round, 3)).astype(np.float32)] for x in (offs, off_means))
+        off_stds.append(rng.uniform(0.2, 1.0, (per_round, 3)).astype(np.float32))
+        inverse = np.linalg.inv(roots[-1])
+        from_ = [jnp.asarray(x) for x in (centres[-1], inverse, off_means[-1], off_stds[-1])]
+        from_ = dict(zip(("centres", "inverse", "off", "off_std"), from_, strict=True))
+        done = _with_round(done, new, jnp.asarray(offs[-1]), _Normals(**from_))
+    at, off = np.concatenate(places).astype(np.float64), np.concatenate(offs)
     density = np.zeros(len(at))
-    for c, root in zip(np.concatenate(centres), np.concatenate(roots).astype(np.float64), strict=True):
-        density += multivariate_normal(c.astype(np.float64), root @ root.T).pdf(at)
+    every = [np.concatenate(x).astype(np.float64) for x in (centres, roots, off_means, off_stds)]
+    for c, root, mean, std in zip(*every, strict=True):
+        density += multivariate_normal(c, root @ root.T).pdf(at) * norm(mean, std).pdf(off).prod(axis=1)
     weights = np.asarray(_log_weights(done))
-    found, expected = weights[:drawn].reshape(-1), 1.0 - np.log(density)
+    found, expected = weights[:drawn].reshape(-1), 1.0 + norm.logpdf(off).sum(axis=1) - np.log(density)
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=2e-3)
     assert np.all(weights[drawn:] == -np.inf)
