@@ -33,7 +33,9 @@ from swarmsim.pytree import pytree
 _EVEN = (0.8191725, 0.6710436, 0.5497005)
 # of what all places are off by: the last three of six dimensions, of the root of x^7 = x + 1
 _EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
-FIRST_SCALES = (4.2, 2.0, 2.0, 1.0)  # standard deviations of the first round, in turn, over those that are promised
+# Standard deviations of the first round, in turn, over those that are promised; the start itself is one of its places.
+# Between walls the posterior may be a needle that none of the others comes near.
+FIRST_SCALES = (4.2, 2.0, 2.0, 1.0, 4.2, 2.0, 2.0, 1.0, 1.0, 2.0, 0.02, 1.0)
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 ABOUT_MEAN = 3  # so many of the scales are about the mean, to see the tails. The others are about likely places.
 TURNED = 1  # number of the round whose places about likely ones lie around a ring; of a ring so do those of every other
@@ -67,6 +69,7 @@ class Posterior:
     covariance: jax.Array  # [4, 4]
     effective: jax.Array  # [] number of independent places that the weighted ones are worth (`_truncated`)
     halves: jax.Array  # [] distance between the means of two halves of the places, in standard deviations
+    likeliest: jax.Array  # [3] of the places that were drawn
 
 
 @pytree
@@ -118,7 +121,8 @@ def sample_posterior(
     index = jnp.arange(per_round)
     starts = start if others is None else jnp.where((index % 2)[:, None], others[index // 2 % len(others)], start)
     normal, normal_off = _normal(rounds, per_round, _EVEN), _normal(rounds, per_round, _EVEN_OFF)
-    local, adapted = index % len(SCALES) >= ABOUT_MEAN, (index % 2 == 1) & (jnp.asarray(off_std_m) > 0.0)
+    begun, later = (jnp.array(x)[index % len(x)] for x in (FIRST_SCALES, SCALES))
+    local, errs = index % len(SCALES) >= ABOUT_MEAN, jnp.asarray(off_std_m) > 0.0
 
     def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
         """Centres [P, 3] and covariances [P, 3, 3] of the next round."""
@@ -127,7 +131,7 @@ def sample_posterior(
         places, ridges = _along_ridges(done, weight, about, local, pivot)
         centres = jnp.where(first, starts, jnp.where(local[:, None], places, mean))
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
-        scales = jnp.where(first, jnp.array(FIRST_SCALES), jnp.array(SCALES))[index % len(SCALES)]
+        scales = jnp.where(first, begun, later)
         return centres, jnp.square(scales)[:, None, None] * spread
 
     def round_(done: _Rounds) -> _Rounds:
@@ -135,7 +139,7 @@ def sample_posterior(
         roots = jnp.linalg.cholesky(covariances + _least(covariances))
         eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
         inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
-        mean, std = _of_off(done, adapted)
+        mean, std = _of_off(done, errs & (begun < 1.0), errs & (index % 2 == 1))
         drawn_from = _Normals(centres=centres, inverse=inverse, off=mean, off_std=std)
         places = centres + jnp.einsum("pij,pj->pi", roots, normal[done.count])
         off = mean + std * normal_off[done.count]
@@ -150,15 +154,17 @@ def sample_posterior(
     return _summary(done, off_std_m)
 
 
-def _of_off(done: _Rounds, adapted: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _of_off(done: _Rounds, begun: jax.Array, adapted: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Means and standard deviations [P, 3] of the error of all places in the next round.
 
-    Those of its prior, but for the ``adapted`` [P] those that were likely so far.
+    Those of its prior; but next to none in the first round where it has ``begun`` [P], and for the ``adapted`` [P] in
+    others those that were likely so far.
     """
+    later = _any_weight(done)
     mean, covariance = _moments(done.off, flattened(_log_weights(done), PLACED_EFFECTIVE))
     std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0.0)), LEAST_OFF, 1.0)
-    now = (adapted & _any_weight(done))[:, None]
-    return jnp.where(now, mean, 0.0), jnp.where(now, std, 1.0)
+    adapted, begun = (adapted & later)[:, None], (begun & ~later)[:, None]
+    return jnp.where(adapted, mean, 0.0), jnp.where(adapted, std, jnp.where(begun, LEAST_OFF, 1.0))
 
 
 def _normal(rounds: int, per_round: int, even: tuple[float, ...]) -> jax.Array:
@@ -256,6 +262,7 @@ def _summary(done: _Rounds, off_std_m: jax.Array | float) -> Posterior:
         covariance=covariance,
         effective=_worth(done),
         halves=_halves(values, log_weights, covariance, _drawn(done)),
+        likeliest=known.place.reshape(-1, 3)[jnp.argmax(_log_posterior(done))],
     )
 
 
@@ -323,8 +330,13 @@ def _log_density(
 
 def _log_weights(done: _Rounds) -> jax.Array:
     """Logarithms [Q, P] of posterior over mixture of the distributions of all rounds so far."""
-    weight = done.known.log_posterior - 0.5 * jnp.sum(jnp.square(done.off), axis=-1) - done.mixture
+    weight = _log_posterior(done) - done.mixture
     return jnp.where(jnp.isfinite(weight), weight, -jnp.inf)
+
+
+def _log_posterior(done: _Rounds) -> jax.Array:
+    """Logarithms [Q, P] of the posterior at each place, by what all places are off there."""
+    return done.known.log_posterior - 0.5 * jnp.sum(jnp.square(done.off), axis=-1)
 
 
 def _any_weight(done: _Rounds) -> jax.Array:

@@ -21,7 +21,7 @@ from swarmsim.estimation.likelihood import natural_background, position_covarian
 from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.nodes import Span, nodes_of
 from swarmsim.estimation.pairs import strain
-from swarmsim.estimation.posterior import of_others, posteriors
+from swarmsim.estimation.posterior import goodness, of_others, posteriors
 from swarmsim.estimation.presumed import Presumed
 from swarmsim.estimation.scan import true_counts
 from swarmsim.estimation.seek import SearchParams
@@ -230,8 +230,11 @@ def sampled(
 def _report(
     presumed: Presumed, problem: Problem, params: LocalisationParams, state: State, limits: jax.Array | bool
 ) -> Estimated:  # fmt: skip
-    site, s, m = presumed.site, state.sources, problem.measurements
-    posterior, told, overall = posteriors(problem, state, params.sample_rounds, params.samples)
+    site, m = presumed.site, problem.measurements
+    of_all = posteriors(problem, state, params.sample_rounds, params.samples)
+    posterior, state = of_all.posterior, of_all.state
+    posterior = replace(posterior, effective=jnp.where(of_all.moved, 0.0, posterior.effective))
+    s, overall = state.sources, goodness(problem, state)
     detection = ratios(problem, state)
     converged, mean, covariance = sampled(presumed, params, s, posterior)
     more = of_others(problem, state)
@@ -261,7 +264,7 @@ def _report(
         effective_samples=jnp.nan_to_num(posterior.effective),
         converged=converged,
         joined_m=s.joined_m,
-        beside_bq=noticed_from(told, params.search.further),
+        beside_bq=noticed_from(of_all.beside, params.search.further),
     )
     strained, usual = strain(problem, state)
     rate = jnp.sum(true_counts(problem, state.added, state.unknowns), axis=1) / jnp.maximum(m.exposure_s, 1e-9)

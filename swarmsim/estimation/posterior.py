@@ -7,11 +7,13 @@ of the model are alike in neighbouring windows, and a posterior that takes each 
 """
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import IN_STEP, each, for_those, some_at_a_time
+from swarmsim.device import IN_STEP, each, for_those, repeat_while, some_at_a_time
 from swarmsim.estimation.fit import alone, settle
 from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
 from swarmsim.estimation.importance_sampling import Posterior, Weighed, drawn_evenly, flattened, sample_posterior
@@ -29,7 +31,7 @@ from swarmsim.estimation.search import (
     screen_of,
     spread,
 )
-from swarmsim.estimation.seek import as_known
+from swarmsim.estimation.seek import as_known, with_source
 from swarmsim.estimation.state import ALONE_STEPS, State, without
 from swarmsim.pytree import pytree
 
@@ -42,6 +44,8 @@ MOVES = 4  # Gauss-Newton steps of the place towards the mode beyond the way; th
 LONGEST_MOVE_M = 1.0
 NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 2  # Gauss-Newton steps at a place
+SWEEPS = 5  # over all sources, at most
+BETTER = 4.0  # in the logarithm of the likelihood, a place at which a source is taken to be from then on
 TOGETHER_M = 25.0  # sources nearer to one another are not known independently of one another
 PLACES_BESIDE = 24  # around a source, at which another one of its nuclide is thought of
 SHARE_BESIDE = 0.1  # of them, at which it may go unnoticed
@@ -56,25 +60,52 @@ class Goodness:
     spread: jax.Array  # [] standard deviation of chi-squared
 
 
-def posteriors(
-    problem: Problem, state: State, rounds: int, per_round: int
-) -> tuple[Posterior, jax.Array, Goodness]:  # fmt: skip
-    """Moments [K] of the posterior of every source, the places of the others held.
+@pytree
+class Sampled:
+    """What is known of K sources; it means nothing where there is none."""
 
-    They mean nothing where there is no source. The second is the information [K] (1/Bq^2) that the counts have about
-    the activity of another source of its nuclide beside it, at least `ONE_M` and at most `COMPANION_M` off, at nine of
-    ten places. The third is how well all of the sources fit.
+    posterior: Posterior  # [K] of each, the places of the others held
+    beside: jax.Array  # [K] information (1/Bq^2) about another one beside each (`_around`)
+    state: State  # of the likeliest places
+    moved: jax.Array  # [] bool: whether a likelier place was found still, from which not all were sampled again
+
+
+def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> Sampled:
+    """Posteriors of all sources, one after another.
+
+    Sampling looks at more places than the search, and at all of what the counts leave open. Where one is found that
+    explains them better the source is there from then on, and all are sampled again beside it.
     """
-    s = state.sources
+    zero, count = jnp.zeros(()), state.sources.present.shape[0]
+    nowhere = Posterior(
+        mean=jnp.zeros(4), covariance=jnp.eye(4), effective=zero, halves=zero, likeliest=jnp.zeros(3)
+    )  # fmt: skip
 
-    def one(k: jax.Array) -> tuple[Posterior, jax.Array]:
-        zero = jnp.zeros(())
-        nothing = Posterior(mean=jnp.zeros(4), covariance=jnp.eye(4), effective=zero, halves=zero), zero
-        return for_those(
-            s.present[k], lambda: _posterior(problem, state, k, rounds, per_round), lambda: nothing, IN_STEP
-        )  # fmt: skip
+    def one(known: tuple[State, jax.Array], k: jax.Array) -> tuple[tuple[State, jax.Array], Any]:
+        state, moved = known
 
-    return *jax.lax.map(one, jnp.arange(s.present.shape[0])), goodness(problem, state)
+        def sample() -> tuple[tuple[State, jax.Array], Any]:
+            posterior, beside = _posterior(problem, state, k, rounds, per_round)
+            after, better = _moved(problem, state, k, posterior.likeliest)
+            return (after, moved | better), (posterior, beside)
+
+        return for_those(state.sources.present[k], sample, lambda: (known, (nowhere, zero)), IN_STEP)
+
+    def sweep(at: tuple[Sampled, jax.Array]) -> tuple[Sampled, jax.Array]:
+        known = at[0].state, jnp.array(False)
+        (state, moved), (posterior, beside) = jax.lax.scan(one, known, jnp.arange(count))
+        return Sampled(posterior=posterior, beside=beside, state=state, moved=moved), at[1] + 1
+
+    every = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), nowhere)
+    start = Sampled(posterior=every, beside=jnp.zeros(count), state=state, moved=jnp.array(True))
+    return repeat_while(lambda at: at[0].moved & (at[1] < SWEEPS), sweep, (start, jnp.int32(0)), IN_STEP)[0]
+
+
+def _moved(problem: Problem, state: State, k: jax.Array, place: jax.Array) -> tuple[State, jax.Array]:
+    """The state with source ``k`` at ``place`` [3], if that explains the counts better; and whether [] it does."""
+    tried = attempt(problem, state.sources.nuclide[k], without(state, k).added, state.unknowns, place)
+    better = tried.fit.likelihood > state.likelihood + BETTER
+    return jax.tree.map(partial(jnp.where, better), with_source(problem, state, k, tried), state), better
 
 
 def of_others(problem: Problem, state: State) -> jax.Array:
@@ -147,7 +178,8 @@ def _around(
     """Places [m, 3] about which the posterior of source ``k`` may have further modes; what is known of one beside it.
 
     Half of the places are likely ones of many all around, by the screen; the rest is the other side of the way. What
-    is known is the second of `posteriors`.
+    is known is the information [] (1/Bq^2) that the counts have about the activity of another source of its nuclide
+    beside it, at least `ONE_M` and at most `COMPANION_M` off, at nine of ten places.
     """
     place, nuclide = state.sources.place[k], state.sources.nuclide[k]
     best = as_known(problem, state, k, jnp.array(False)).fit

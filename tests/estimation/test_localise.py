@@ -258,6 +258,7 @@ def test_a_posterior_that_is_no_number_is_the_place_found_with_the_reach_of_the_
         covariance=jnp.stack([0.01 * jnp.eye(4), bad]),
         effective=jnp.array([50.0, jnp.nan]),
         halves=jnp.array([0.1, jnp.nan]),
+        likeliest=jnp.zeros((2, 3)),
     )
     converged, mean, covariance = sampled(localiser.presumed, localiser.params, sources, posterior)
     reach = float(localiser.params.search.reach_m)
@@ -274,6 +275,7 @@ def test_places_worth_too_few_have_no_small_error(localiser):
         covariance=jnp.broadcast_to(1e-4 * jnp.eye(4), (2, 4, 4)),
         effective=jnp.array([50.0, 3.0]),
         halves=jnp.array([2.0, 0.1]),
+        likeliest=jnp.zeros((2, 3)),
     )
     converged, _, covariance = sampled(localiser.presumed, localiser.params, localiser.nothing.sources, few)
     assert converged.tolist() == [False, False]

@@ -271,7 +271,7 @@ def _state(problem, at):
 
 @jax.jit
 def _sample(problem, state):
-    return jax.tree.map(lambda x: x[0], posteriors(problem, state, 6, 64)[0])
+    return jax.tree.map(lambda x: x[0], posteriors(problem, state, 6, 64).posterior)
 
 
 @jax.jit
