@@ -16,6 +16,9 @@ of those are of use. The others lie each along the ridge as it runs at a likely 
 Martino, Luengo and Corander, ICASSP 2015, 4075), as far as it is straight there. A source next to a place where a
 vehicle stood, or climbed, may lie in any direction from it, and all of a ring is likely: in the second round those
 places lie around the ring through the likeliest place so far, and if much of it is likely in every other round.
+
+What all places are off by from the site's geometry is drawn with each of them: it moves the walls' shadows, which tell
+it in turn where they are sharp. Half of its draws follow what was likely so far, the others its prior.
 """
 
 from collections.abc import Callable
@@ -26,11 +29,12 @@ import jax.numpy as jnp
 from swarmsim.device import each, repeat_while
 from swarmsim.estimation.likelihood import scaled_inverse
 from swarmsim.estimation.search import TOGETHER
+from swarmsim.estimation.weights import EVEN, drawn_evenly, flattened, moments, truncated, worth
 from swarmsim.pytree import pytree
 
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
 # "The unreasonable effectiveness of quasirandom sequences", 2018).
-_EVEN = (0.8191725, 0.6710436, 0.5497005)
+_EVEN = (EVEN, 0.6710436, 0.5497005)
 # of what all places are off by: the last three of six dimensions, of the root of x^7 = x + 1
 _EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
 # Standard deviations of the first round, in turn, over those that are promised; the start itself is one of its places.
@@ -67,7 +71,7 @@ class Posterior:
 
     mean: jax.Array  # [4]
     covariance: jax.Array  # [4, 4]
-    effective: jax.Array  # [] number of independent places that the weighted ones are worth (`_truncated`)
+    effective: jax.Array  # [] number of independent places that the weighted ones are worth (`truncated`)
     halves: jax.Array  # [] distance between the means of two halves of the places, in standard deviations
     likeliest: jax.Array  # [3] of the places that were drawn
 
@@ -127,7 +131,7 @@ def sample_posterior(
     def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
         """Centres [P, 3] and covariances [P, 3, 3] of the next round."""
         first, weight = ~_any_weight(done), flattened(_log_weights(done), PLACED_EFFECTIVE)
-        mean, about = _moments(done.known.place, weight)
+        mean, about = moments(done.known.place, weight)
         places, ridges = _along_ridges(done, weight, about, local, pivot)
         centres = jnp.where(first, starts, jnp.where(local[:, None], places, mean))
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
@@ -161,7 +165,7 @@ def _of_off(done: _Rounds, begun: jax.Array, adapted: jax.Array) -> tuple[jax.Ar
     others those that were likely so far.
     """
     later = _any_weight(done)
-    mean, covariance = _moments(done.off, flattened(_log_weights(done), PLACED_EFFECTIVE))
+    mean, covariance = moments(done.off, flattened(_log_weights(done), PLACED_EFFECTIVE))
     std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0.0)), LEAST_OFF, 1.0)
     adapted, begun = (adapted & later)[:, None], (begun & ~later)[:, None]
     return jnp.where(adapted, mean, 0.0), jnp.where(adapted, std, jnp.where(begun, LEAST_OFF, 1.0))
@@ -219,7 +223,7 @@ def _along_ridges(
     likely = jnp.where(begun, best, likely)
     places = known.place[likely]
     ridges = _ridge(known.information[likely] + jnp.where(turn, 0.0, narrower), places, pivot)
-    share = (jnp.cumsum(local) - 1 + jnp.mod(done.count * _EVEN[0], 1.0)) / jnp.maximum(jnp.sum(local), 1)
+    share = (jnp.cumsum(local) - 1 + jnp.mod(done.count * EVEN, 1.0)) / jnp.maximum(jnp.sum(local), 1)
     return _turned(places, ridges, pivot, jnp.where(turn, 2.0 * jnp.pi * share, 0.0))
 
 
@@ -255,7 +259,7 @@ def _summary(done: _Rounds, off_std_m: jax.Array | float) -> Posterior:
     known, log_weights = done.known, _log_weights(done)
     weight = flattened(log_weights, LEAST_EFFECTIVE)
     values = jnp.concatenate([known.place - off_std_m * done.off, known.log_activity[..., None]], axis=-1)
-    mean, covariance = _moments(values, weight)
+    mean, covariance = moments(values, weight)
     covariance = covariance.at[3, 3].add(jnp.sum(jnp.where(weight > 0.0, weight * known.variance, 0.0)))
     return Posterior(
         mean=mean,
@@ -266,15 +270,6 @@ def _summary(done: _Rounds, off_std_m: jax.Array | float) -> Posterior:
     )
 
 
-def drawn_evenly(weight: jax.Array, count: int) -> jax.Array:
-    """Numbers [count] of places, each as often as its weight [N] says (systematic resampling, Kitagawa 1996)."""
-    at = (jnp.arange(count) + 0.5) / count
-    index = jnp.searchsorted(jnp.cumsum(weight), at)
-    # neighbours in the order of the places have different scales
-    turned = jnp.argsort(jnp.mod(jnp.arange(count) * _EVEN[0], 1.0))
-    return jnp.minimum(index, weight.shape[0] - 1)[turned]
-
-
 def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, drawn: jax.Array) -> jax.Array:
     """How far the means of two halves of the places of each round lie apart, in standard deviations of x and y.
 
@@ -282,7 +277,7 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, dr
     """
     odd = jnp.arange(values.shape[1]) // len(SCALES) % 2 == 1  # both halves have all scales
     means = [
-        _moments(values, _truncated(jnp.where(half, log_weights, -jnp.inf), 0.5 * drawn))[0]
+        moments(values, truncated(jnp.where(half, log_weights, -jnp.inf), 0.5 * drawn))[0]
         for half in (odd, jnp.logical_not(odd))
     ]
     apart = jnp.abs(means[0] - means[1])[:2] / jnp.sqrt(jnp.maximum(jnp.diagonal(covariance)[:2], LEAST_STD_M**2))
@@ -346,57 +341,9 @@ def _any_weight(done: _Rounds) -> jax.Array:
 
 def _worth(done: _Rounds) -> jax.Array:
     """How many independent places [] the weighted ones are worth."""
-    return jnp.where(_any_weight(done), _effective(_truncated(_log_weights(done), _drawn(done))), 0.0)
+    return jnp.where(_any_weight(done), worth(truncated(_log_weights(done), _drawn(done))), 0.0)
 
 
 def _drawn(done: _Rounds) -> jax.Array:
     """Number [] of places drawn so far."""
     return (done.count * done.mixture.shape[1]).astype(jnp.float32)
-
-
-def _weights(log_weights: jax.Array, power: jax.Array | float = 1.0) -> jax.Array:
-    """Weights [...] of sum 1 to a power; equal ones where no place has any."""
-    top = jnp.max(log_weights)
-    relative = jnp.where(jnp.isfinite(top), log_weights - top, 0.0)
-    return jax.nn.softmax(jnp.where(jnp.isfinite(relative), power * relative, -jnp.inf), axis=None)
-
-
-def _effective(weights: jax.Array) -> jax.Array:
-    """How many equal weights these are worth [] (Kish 1965)."""
-    return 1.0 / jnp.sum(jnp.square(weights))
-
-
-def flattened(log_weights: jax.Array, effective: float) -> jax.Array:
-    """Weights [...] of sum 1 to the greatest power, at most 1, that makes them worth ``effective`` equal ones."""
-
-    def halve(_: int, bracket: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        low, high = bracket
-        middle = 0.5 * (low + high)
-        enough = _effective(_weights(log_weights, jnp.exp(middle))) >= effective
-        return jnp.where(enough, middle, low), jnp.where(enough, high, middle)
-
-    low, _ = jax.lax.fori_loop(0, 12, halve, (jnp.asarray(-12.0), jnp.asarray(0.0)))
-    enough = _effective(_weights(log_weights)) >= effective
-    return _weights(log_weights, jnp.where(enough, 1.0, jnp.exp(low)))
-
-
-def _truncated(log_weights: jax.Array, drawn: jax.Array) -> jax.Array:
-    """Weights [...] of sum 1, cut off at their mean times the root of their number (Ionides, JCGS 17, 2008, 295).
-
-    A place that the distributions drawn from hardly ever reach would otherwise outweigh all others. That number is of
-    those ``drawn`` [], not of all that there is room for.
-    """
-    weights = _weights(log_weights)
-    weights = jnp.minimum(weights, jax.lax.rsqrt(jnp.maximum(drawn, 1.0)))
-    return weights / jnp.sum(weights)
-
-
-def _moments(values: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean [k] and covariance [k, k] of ``values`` [..., k] under weights [...] of sum 1."""
-    flat, w = values.reshape(-1, values.shape[-1]), weight.reshape(-1)
-    # relative to the heaviest: a mean of large coordinates would lose digits in float32
-    origin = flat[jnp.argmax(w)]
-    offset = jnp.where(w[:, None] > 0.0, flat - origin, 0.0)
-    mean = w @ offset
-    apart = offset - mean
-    return origin + mean, (apart * w[:, None]).T @ apart

@@ -4,6 +4,10 @@
 
 The likelihood is raised to a power below one, the learning rate (Holmes and Walker, Biometrika 104, 2017, 497): errors
 of the model are alike in neighbouring windows, and a posterior that takes each for one of its own is too narrow.
+
+The posterior of a source holds the places of the others. Where sampling finds a place of one that explains the counts
+better than the search had, the source is moved and all are sampled again (Besag, "On the statistical analysis of dirty
+pictures", JRSS B 48, 1986, 259: iterated conditional modes).
 """
 
 from dataclasses import replace
@@ -16,7 +20,7 @@ import jax.numpy as jnp
 from swarmsim.device import IN_STEP, each, for_those, repeat_while, some_at_a_time
 from swarmsim.estimation.fit import alone, settle
 from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
-from swarmsim.estimation.importance_sampling import Posterior, Weighed, drawn_evenly, flattened, sample_posterior
+from swarmsim.estimation.importance_sampling import Posterior, Weighed, sample_posterior
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, joint_equations, normal_equations
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
@@ -33,6 +37,7 @@ from swarmsim.estimation.search import (
 )
 from swarmsim.estimation.seek import as_known, with_source
 from swarmsim.estimation.state import ALONE_STEPS, State, without
+from swarmsim.estimation.weights import drawn_evenly, flattened
 from swarmsim.pytree import pytree
 
 SCOUTS = 96  # places at which the screen looks for further modes
