@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from swarmsim.device import each, repeat_while
 from swarmsim.estimation.likelihood import scaled_inverse
 from swarmsim.estimation.search import TOGETHER
-from swarmsim.estimation.weights import EVEN, drawn_evenly, flattened, moments, truncated, worth
+from swarmsim.estimation.weights import EVEN, drawn_evenly, flattened, moments, normalised, truncated, worth
 from swarmsim.pytree import pytree
 
 # Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
@@ -41,6 +41,8 @@ _EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
 # Between walls the posterior may be a needle that none of the others comes near.
 FIRST_SCALES = (4.2, 2.0, 2.0, 1.0, 4.2, 2.0, 2.0, 1.0, 1.0, 2.0, 0.02, 1.0)
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
+CLOSER = (1.0, 0.3, 0.1)  # the same in turn of those about the likeliest place, while a few outweigh all others
+FEW = 2.0  # so many
 ABOUT_MEAN = 3  # so many of the scales are about the mean, to see the tails. The others are about likely places.
 TURNED = 1  # number of the round whose places about likely ones lie around a ring; of a ring so do those of every other
 RING = 0.4  # of its radius: standard deviation from which on places are taken to lie on one
@@ -135,7 +137,11 @@ def sample_posterior(
         places, ridges = _along_ridges(done, weight, about, local, pivot)
         centres = jnp.where(first, starts, jnp.where(local[:, None], places, mean))
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
-        scales = jnp.where(first, begun, later)
+        # a tip that is much narrower than all that is known is closed in on
+        few = ~first & (worth(normalised(_log_weights(done))) < FEW)
+        closer = jnp.where(few & local, jnp.array(CLOSER)[(index // len(SCALES)) % len(CLOSER)], 1.0)
+        centres = jnp.where((closer < 1.0)[:, None], _likeliest(done), centres)
+        scales = jnp.where(first, begun, later * closer)
         return centres, jnp.square(scales)[:, None, None] * spread
 
     def round_(done: _Rounds) -> _Rounds:
@@ -266,7 +272,7 @@ def _summary(done: _Rounds, off_std_m: jax.Array | float) -> Posterior:
         covariance=covariance,
         effective=_worth(done),
         halves=_halves(values, log_weights, covariance, _drawn(done)),
-        likeliest=known.place.reshape(-1, 3)[jnp.argmax(_log_posterior(done))],
+        likeliest=_likeliest(done),
     )
 
 
@@ -332,6 +338,11 @@ def _log_weights(done: _Rounds) -> jax.Array:
 def _log_posterior(done: _Rounds) -> jax.Array:
     """Logarithms [Q, P] of the posterior at each place, by what all places are off there."""
     return done.known.log_posterior - 0.5 * jnp.sum(jnp.square(done.off), axis=-1)
+
+
+def _likeliest(done: _Rounds) -> jax.Array:
+    """The likeliest place [3] so far."""
+    return done.known.place.reshape(-1, 3)[jnp.argmax(_log_posterior(done))]
 
 
 def _any_weight(done: _Rounds) -> jax.Array:

@@ -24,7 +24,7 @@ from swarmsim.estimation.importance_sampling import (
     sample_posterior,
 )
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.posterior import WEIGH_STEPS, in_pairs, posteriors
+from swarmsim.estimation.posterior import BETTER, WEIGH_STEPS, in_pairs, posteriors
 from swarmsim.estimation.search import attempt, mirrored_place
 from swarmsim.estimation.state import Sources, no_sources
 from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
@@ -68,7 +68,8 @@ def test_what_all_places_are_off_by_is_told_by_walls_alone(walls_m):
     expected = np.linalg.inv(np.linalg.inv(covariance + off_std**2 * np.eye(3)) + np.linalg.inv(site))
     std = np.sqrt(np.diag(expected))
     assert np.all(np.abs(np.asarray(found.mean)[:3] - mean) < 0.35 * std)
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)[:3]), std, rtol=0.2)
+    # of 40 independent places a standard deviation is known to 11 %
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)[:3]), std, rtol=0.3)
     assert float(found.effective) >= 40.0
 
 
@@ -218,6 +219,19 @@ def _of_two_places(turn):
     return sample_posterior(weigh, jnp.zeros(3), jnp.diag(jnp.array([100.0, 100.0, 0.01])), 4, 8)
 
 
+def test_a_needle_at_the_start_is_not_missed():
+    """As of a source between walls: known to a centimetre, in a region that is promised to be metres wide."""
+
+    def weigh(x, _):
+        needle = 1e3 - 0.5 * jnp.sum(jnp.square(x / 0.01))
+        return weighed(x, jnp.logaddexp(needle, -0.5 * jnp.sum(jnp.square((x - 2.0) / 0.3))))
+
+    found = jax.jit(lambda: sample_posterior(weigh, jnp.zeros(3), 4.0 * jnp.eye(3), 24, 24))()
+    assert float(jnp.max(jnp.abs(found.mean[:3]))) < 0.01
+    np.testing.assert_allclose(jnp.sqrt(jnp.diagonal(found.covariance)[:3]), 0.01, rtol=0.25)
+    assert float(found.effective) >= 40.0
+
+
 def test_places_far_apart_that_span_no_volume_do_not_end_sampling():
     found = _of_two_places(jnp.linspace(0.0, np.pi, 64))
     assert bool(jnp.all(jnp.isfinite(found.mean)))
@@ -270,8 +284,12 @@ def _state(problem, at):
 
 
 @jax.jit
+def _sampled(problem, state):
+    return posteriors(problem, state, 6, 64)
+
+
 def _sample(problem, state):
-    return jax.tree.map(lambda x: x[0], posteriors(problem, state, 6, 64).posterior)
+    return jax.tree.map(lambda x: x[0], _sampled(problem, state).posterior)
 
 
 @jax.jit
@@ -299,6 +317,20 @@ def integral(problem, state, reach):
     variance = weight @ (theta - mean) ** 2
     variance[3] += weight @ own / rate
     return mean, np.sqrt(variance)
+
+
+@pytest.mark.parametrize("boxes", [[], WALLS])
+def test_sampling_moves_a_source_that_the_search_left_beside_its_place(boxes):
+    problem, at_its_place = told(boxes, 0)
+    beside = _state(problem, AT + jnp.array([1.5, -1.0, 0.0]))
+    assert float(beside.likelihood) < float(at_its_place.likelihood) - 2.0 * BETTER
+    found = _sampled(problem, beside)
+    assert not bool(found.moved)
+    assert float(found.state.likelihood) > float(at_its_place.likelihood) - BETTER
+    again = _sample(problem, at_its_place)
+    std = np.sqrt(np.diag(again.covariance)[:2])
+    assert np.all(np.abs(found.posterior.mean[0, :2] - again.mean[:2]) < std)
+    np.testing.assert_allclose(found.state.sources.activity_bq[0], ACTIVITY, rtol=0.15)
 
 
 @pytest.mark.parametrize("seed", range(3))
