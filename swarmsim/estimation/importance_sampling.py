@@ -52,7 +52,9 @@ ENOUGH_EFFECTIVE = 40.0  # no further rounds are needed then
 LEAST_ROUNDS = 5
 LEAST_STD_M = 1e-3
 OFF_WIDER = 1.2  # standard deviations of the error of all places that are drawn, over those so far
-LEAST_OFF = 0.2  # of its prior's
+LEAST_OFF = 0.1  # of its prior's
+OFF_EFFECTIVE = 16.0  # weights are flattened until they count as this many for its distribution
+SHRUNK = 0.1  # of the variance of places, by which what the error follows from them is lessened
 LEAST_SHARE = 1e-3  # standard deviation of a round in any direction, over that in all: two places far apart span one
 
 
@@ -84,8 +86,9 @@ class _Normals:
 
     centres: jax.Array  # [..., 3]
     inverse: jax.Array  # [..., 3, 3] of the lower triangular root of the covariance
-    off: jax.Array  # [..., 3]
+    off: jax.Array  # [..., 3] mean of that at the centre
     off_std: jax.Array  # [..., 3]
+    slope: jax.Array  # [..., 3, 3] change of that mean with the place
 
 
 @pytree
@@ -149,10 +152,10 @@ def sample_posterior(
         roots = jnp.linalg.cholesky(covariances + _least(covariances))
         eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
         inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
-        mean, std = _of_off(done, errs & (begun < 1.0), errs & (index % 2 == 1))
-        drawn_from = _Normals(centres=centres, inverse=inverse, off=mean, off_std=std)
-        places = centres + jnp.einsum("pij,pj->pi", roots, normal[done.count])
-        off = mean + std * normal_off[done.count]
+        mean, std, slope = _of_off(done, centres, errs & (begun < 1.0), errs & (index % 2 == 1))
+        drawn_from = _Normals(centres=centres, inverse=inverse, off=mean, off_std=std, slope=slope)
+        aside = jnp.einsum("pij,pj->pi", roots, normal[done.count])
+        places, off = centres + aside, mean + jnp.einsum("pij,pj->pi", slope, aside) + std * normal_off[done.count]
         drawn = each(lambda x: weigh(*x), (places, off_std_m * off), TOGETHER)
         return _with_round(done, drawn, off, drawn_from)
 
@@ -164,17 +167,29 @@ def sample_posterior(
     return _summary(done, off_std_m)
 
 
-def _of_off(done: _Rounds, begun: jax.Array, adapted: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Means and standard deviations [P, 3] of the error of all places in the next round.
+def _of_off(
+    done: _Rounds, centres: jax.Array, begun: jax.Array, adapted: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:  # fmt: skip
+    """The error of all places in the next round, about ``centres`` [P, 3]: see `_Normals`.
 
-    Those of its prior; but next to none in the first round where it has ``begun`` [P], and for the ``adapted`` [P] in
-    others those that were likely so far.
+    That of its prior; but next to none in the first round where it has ``begun`` [P], and for the ``adapted`` [P] in
+    others as it was likely so far. Walls tell where a source is on the site and distances where it is to the vehicles,
+    so that the error follows from the place where both are sharp.
     """
     later = _any_weight(done)
-    mean, covariance = moments(done.off, flattened(_log_weights(done), PLACED_EFFECTIVE))
-    std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0.0)), LEAST_OFF, 1.0)
+    both = jnp.concatenate([done.known.place, done.off], axis=-1)
+    mean, covariance = moments(both, flattened(_log_weights(done), OFF_EFFECTIVE))
+    of_place, across, own = covariance[:3, :3], covariance[3:, :3], jnp.diagonal(covariance)[3:]
+    slope = across @ scaled_inverse(of_place * (1.0 + SHRUNK * jnp.eye(3)) + _least(of_place))
+    left = own - jnp.sum(slope * across, axis=1)
+    std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(left, 0.0)), LEAST_OFF, 1.0)
+    at = mean[3:] + (centres - mean[:3]) @ slope.T
     adapted, begun = (adapted & later)[:, None], (begun & ~later)[:, None]
-    return jnp.where(adapted, mean, 0.0), jnp.where(adapted, std, jnp.where(begun, LEAST_OFF, 1.0))
+    return (
+        jnp.where(adapted, at, 0.0),
+        jnp.where(adapted, std, jnp.where(begun, LEAST_OFF, 1.0)),
+        jnp.where(adapted[..., None], slope, 0.0),
+    )
 
 
 def _normal(rounds: int, per_round: int, even: tuple[float, ...]) -> jax.Array:
@@ -203,7 +218,7 @@ def _nowhere(rounds: int, per_round: int) -> _Rounds:
     return _Rounds(
         known=empty,
         off=places,
-        drawn_from=_Normals(centres=places, inverse=eye, off=places, off_std=jnp.ones_like(places)),
+        drawn_from=_Normals(centres=places, inverse=eye, off=places, off_std=jnp.ones_like(places), slope=0.0 * eye),
         mixture=empty.log_posterior,
         count=jnp.int32(0),
     )
@@ -323,7 +338,10 @@ def _log_density(
     """
     offset = (places - origin)[:, None] - (of.centres - origin)
     turned = [sum(of.inverse[:, i, j] * offset[..., j] for j in range(i + 1)) for i in range(3)]
-    turned += [(off[:, i, None] - of.off[:, i]) / of.off_std[:, i] for i in range(3)]
+    left = [
+        off[:, i, None] - of.off[:, i] - sum(of.slope[:, i, j] * offset[..., j] for j in range(3)) for i in range(3)
+    ]
+    turned += [left[i] / of.off_std[:, i] for i in range(3)]
     sharp = jnp.sum(jnp.log(jnp.diagonal(of.inverse, axis1=1, axis2=2)) - jnp.log(of.off_std), axis=1)
     each_ = sharp - 0.5 * sum(jnp.square(x) for x in turned)
     return jax.scipy.special.logsumexp(jnp.where(drawn, each_, -jnp.inf), axis=1)
