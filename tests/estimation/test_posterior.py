@@ -201,7 +201,7 @@ def test_a_few_places_that_outweigh_all_others_are_not_worth_many():
     eye = jnp.broadcast_to(jnp.eye(3), (40, 24, 3, 3))
     known = replace(weighed(jnp.zeros((40, 24, 3)), jnp.float32(value), zero, zero), information=eye)
     off = jnp.zeros((40, 24, 3))
-    drawn_from = _Normals(centres=known.place, inverse=eye, off=off, off_std=off + 1.0)
+    drawn_from = _Normals(centres=known.place, inverse=eye, off=off, off_std=off + 1.0, slope=0.0 * eye)
     done = _Rounds(known=known, off=off, drawn_from=drawn_from, mixture=zero, count=jnp.int32(5))
     assert float(_worth(done)) < 5.0
 
@@ -439,9 +439,9 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
     eye = jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
     empty = replace(weighed(jnp.zeros((rounds, per_round, 3)), none - jnp.inf, none, none), information=eye)
     zero = empty.place
-    nothing = _Normals(centres=zero, inverse=eye, off=zero, off_std=zero + 1.0)
+    nothing = _Normals(centres=zero, inverse=eye, off=zero, off_std=zero + 1.0, slope=0.0 * eye)
     done = _Rounds(known=empty, off=zero, drawn_from=nothing, mixture=none - jnp.inf, count=jnp.int32(0))
-    places, centres, roots, offs, off_means, off_stds = [], [], [], [], [], []
+    places, centres, roots, offs, off_means, off_stds, slopes = [], [], [], [], [], [], []
     for _ in range(drawn):
         # far from the origin of the site, and from one round to the next
         centres.append((rng.normal(size=(per_round, 3)) * 2.0 + [3000.0, -2000.0, 1.0]).astype(np.float32))
@@ -451,15 +451,17 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
         new = replace(weighed(jnp.asarray(places[-1]), none[0] + 1.0, none[0], none[0]), information=eye[0])
         offs, off_means = ([*x, rng.normal(size=(per_round, 3)).astype(np.float32)] for x in (offs, off_means))
         off_stds.append(rng.uniform(0.2, 1.0, (per_round, 3)).astype(np.float32))
+        slopes.append(rng.normal(size=(per_round, 3, 3)).astype(np.float32))
         inverse = np.linalg.inv(roots[-1])
-        from_ = [jnp.asarray(x) for x in (centres[-1], inverse, off_means[-1], off_stds[-1])]
-        from_ = dict(zip(("centres", "inverse", "off", "off_std"), from_, strict=True))
+        from_ = [jnp.asarray(x) for x in (centres[-1], inverse, off_means[-1], off_stds[-1], slopes[-1])]
+        from_ = dict(zip(("centres", "inverse", "off", "off_std", "slope"), from_, strict=True))
         done = _with_round(done, new, jnp.asarray(offs[-1]), _Normals(**from_))
     at, off = np.concatenate(places).astype(np.float64), np.concatenate(offs)
     density = np.zeros(len(at))
-    every = [np.concatenate(x).astype(np.float64) for x in (centres, roots, off_means, off_stds)]
-    for c, root, mean, std in zip(*every, strict=True):
-        density += multivariate_normal(c, root @ root.T).pdf(at) * norm(mean, std).pdf(off).prod(axis=1)
+    every = [np.concatenate(x).astype(np.float64) for x in (centres, roots, off_means, off_stds, slopes)]
+    for c, root, mean, std, slope in zip(*every, strict=True):
+        about = norm(mean + (at - c) @ slope.T, std)
+        density += multivariate_normal(c, root @ root.T).pdf(at) * about.pdf(off).prod(axis=1)
     weights = np.asarray(_log_weights(done))
     found, expected = weights[:drawn].reshape(-1), 1.0 + norm.logpdf(off).sum(axis=1) - np.log(density)
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=2e-3)
