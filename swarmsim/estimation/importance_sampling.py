@@ -29,17 +29,27 @@ import jax.numpy as jnp
 from swarmsim.device import each, repeat_while
 from swarmsim.estimation.likelihood import scaled_inverse
 from swarmsim.estimation.search import TOGETHER
-from swarmsim.estimation.weights import EVEN, drawn_evenly, flattened, moments, normalised, truncated, worth
+from swarmsim.estimation.weights import (
+    EVEN,
+    drawn_evenly,
+    even_normals,
+    flattened,
+    moments,
+    normalised,
+    truncated,
+    worth,
+)
 from swarmsim.pytree import pytree
 
-# Fractional parts of multiples of these fill the unit cube evenly: powers of the root 1.2207 of x^4 = x + 1 (Roberts,
-# "The unreasonable effectiveness of quasirandom sequences", 2018).
-_EVEN = (EVEN, 0.6710436, 0.5497005)
-# of what all places are off by: the last three of six dimensions, of the root of x^7 = x + 1
+# of what all places are off by (`even_normals`): the last three of six dimensions, of the root of x^7 = x + 1
 _EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
 # Standard deviations of the first round, in turn, over those that are promised; the start itself is one of its places.
 # Between walls the posterior may be a needle that none of the others comes near.
-FIRST_SCALES = (4.2, 2.0, 2.0, 1.0, 4.2, 2.0, 2.0, 1.0, 1.0, 2.0, 0.02, 1.0)
+FIRST_SCALES = (4.2, 2.0, 1.0, 2.0, 2.0, 4.2, 1.0, 1.0, 0.02, 2.0, 2.0, 1.0)
+MODE_ROUNDS = 5  # in which half of the places lie about modes that are given; later a quarter do
+NEIGHBOUR = 6  # they are spread over modes as this one of their neighbours is away,
+OVERLAP = 0.6  # times this,
+MODE_STDS_M = (0.03, 0.6)  # at least and at most
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 CLOSER = (1.0, 0.3, 0.1)  # the same in turn of those about the likeliest place, while a few outweigh all others
 FEW = 2.0  # so many
@@ -108,7 +118,7 @@ def sample_posterior(
     covariance: jax.Array,
     rounds: int,
     per_round: int,
-    others: jax.Array | None = None,
+    modes: jax.Array | None = None,
     pivot: jax.Array | None = None,
     off_std_m: jax.Array | float = 0.0,
 ) -> Posterior:
@@ -123,36 +133,50 @@ def sample_posterior(
         covariance: [3, 3] about that of the posterior near it.
         rounds: at most (static).
         per_round: places in a round (static).
-        others: [m, 3] places about which half of the first ones lie, in turn, where there may be further modes.
+        modes: [m, 3] likely places in all modes that the posterior may have, evenly in any order: some of a round's
+            lie about them, in turn.
         pivot: [3] around which what is likely may lie on a ring; without one ridges are taken to be straight.
         off_std_m: [] standard deviation of the error.
     """
-    index = jnp.arange(per_round)
-    starts = start if others is None else jnp.where((index % 2)[:, None], others[index // 2 % len(others)], start)
-    normal, normal_off = _normal(rounds, per_round, _EVEN), _normal(rounds, per_round, _EVEN_OFF)
-    begun, later = (jnp.array(x)[index % len(x)] for x in (FIRST_SCALES, SCALES))
+    index, half = jnp.arange(per_round), per_round // 2
+    modes = jnp.zeros((0, 3)) if modes is None else modes
+    normal, normal_off = even_normals(rounds, per_round), even_normals(rounds, per_round, _EVEN_OFF)
+    first_scale, later_scale = (jnp.array(x)[index % len(x)] for x in (FIRST_SCALES, SCALES))
+    mode_std_m = jnp.clip(_spacing(modes), *MODE_STDS_M) if len(modes) else modes
     local, errs = index % len(SCALES) >= ABOUT_MEAN, jnp.asarray(off_std_m) > 0.0
+
+    def about_modes(done: _Rounds) -> jax.Array:
+        """Which places [P] of the next round lie about modes."""
+        of_four = index % 4
+        return (len(modes) > 0) & ((of_four == 1) | ((of_four == 2) & (done.count < MODE_ROUNDS)))
 
     def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
         """Centres [P, 3] and covariances [P, 3, 3] of the next round."""
         first, weight = ~_any_weight(done), flattened(_log_weights(done), PLACED_EFFECTIVE)
         mean, about = moments(done.known.place, weight)
         places, ridges = _along_ridges(done, weight, about, local, pivot)
-        centres = jnp.where(first, starts, jnp.where(local[:, None], places, mean))
+        centres = jnp.where(first, start, jnp.where(local[:, None], places, mean))
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
         # a tip that is much narrower than all that is known is closed in on
         few = ~first & (worth(normalised(_log_weights(done))) < FEW)
         closer = jnp.where(few & local, jnp.array(CLOSER)[(index // len(SCALES)) % len(CLOSER)], 1.0)
         centres = jnp.where((closer < 1.0)[:, None], _likeliest(done), centres)
-        scales = jnp.where(first, begun, later * closer)
-        return centres, jnp.square(scales)[:, None, None] * spread
+        covariances = jnp.square(jnp.where(first, first_scale, later_scale * closer))[:, None, None] * spread
+        if len(modes) == 0:
+            return centres, covariances
+        number = (done.count * half + index // 2) % len(modes)
+        mode, std_m = modes[number], mode_std_m[number]
+        narrow, beside = jnp.square(std_m)[:, None, None] * jnp.eye(3), about_modes(done)[:, None]
+        return jnp.where(beside, mode, centres), jnp.where(beside[..., None], narrow, covariances)
 
     def round_(done: _Rounds) -> _Rounds:
         centres, covariances = placed(done)
         roots = jnp.linalg.cholesky(covariances + _least(covariances))
         eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
         inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
-        mean, std, slope = _of_off(done, centres, errs & (begun < 1.0), errs & (index % 2 == 1))
+        modes_, later = about_modes(done), _any_weight(done)
+        exact = (modes_ | (first_scale < 1.0)) & (done.count == 0)
+        mean, std, slope = _of_off(done, centres, errs & exact, errs & later & (index % 2 == 1))
         drawn_from = _Normals(centres=centres, inverse=inverse, off=mean, off_std=std, slope=slope)
         aside = jnp.einsum("pij,pj->pi", roots, normal[done.count])
         places, off = centres + aside, mean + jnp.einsum("pij,pj->pi", slope, aside) + std * normal_off[done.count]
@@ -167,16 +191,21 @@ def sample_posterior(
     return _summary(done, off_std_m)
 
 
+def _spacing(modes: jax.Array) -> jax.Array:
+    """Standard deviations [m] in m about ``modes`` [m, 3], by the distances between these: needles are narrow."""
+    apart = jnp.linalg.norm(modes[:, None] - modes, axis=-1)
+    return OVERLAP * jnp.sort(apart, axis=1)[:, min(NEIGHBOUR, len(modes) - 1)]
+
+
 def _of_off(
-    done: _Rounds, centres: jax.Array, begun: jax.Array, adapted: jax.Array
+    done: _Rounds, centres: jax.Array, exact: jax.Array, adapted: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:  # fmt: skip
     """The error of all places in the next round, about ``centres`` [P, 3]: see `_Normals`.
 
-    That of its prior; but next to none in the first round where it has ``begun`` [P], and for the ``adapted`` [P] in
-    others as it was likely so far. Walls tell where a source is on the site and distances where it is to the vehicles,
-    so that the error follows from the place where both are sharp.
+    That of its prior; but next to none for those that are ``exact`` [P], and for the ``adapted`` [P] as it was likely
+    so far. Walls tell where a source is on the site and distances where it is to the vehicles, so that the error
+    follows from the place where both are sharp.
     """
-    later = _any_weight(done)
     both = jnp.concatenate([done.known.place, done.off], axis=-1)
     mean, covariance = moments(both, flattened(_log_weights(done), OFF_EFFECTIVE))
     of_place, across, own = covariance[:3, :3], covariance[3:, :3], jnp.diagonal(covariance)[3:]
@@ -184,18 +213,12 @@ def _of_off(
     left = own - jnp.sum(slope * across, axis=1)
     std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(left, 0.0)), LEAST_OFF, 1.0)
     at = mean[3:] + (centres - mean[:3]) @ slope.T
-    adapted, begun = (adapted & later)[:, None], (begun & ~later)[:, None]
+    adapted, exact = adapted[:, None], exact[:, None]
     return (
         jnp.where(adapted, at, 0.0),
-        jnp.where(adapted, std, jnp.where(begun, LEAST_OFF, 1.0)),
+        jnp.where(adapted, std, jnp.where(exact, LEAST_OFF, 1.0)),
         jnp.where(adapted[..., None], slope, 0.0),
     )
-
-
-def _normal(rounds: int, per_round: int, even: tuple[float, ...]) -> jax.Array:
-    """Standard normal numbers [rounds, per_round, 3] that fill space evenly."""
-    share = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(even), 1.0)
-    return jax.scipy.special.ndtri(jnp.clip(share, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
 
 
 def _least(covariance: jax.Array) -> jax.Array:

@@ -17,43 +17,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import IN_STEP, each, for_those, repeat_while, some_at_a_time
+from swarmsim.device import IN_STEP, for_those, repeat_while, some_at_a_time
 from swarmsim.estimation.fit import alone, settle
-from swarmsim.estimation.forward import Problem, ways_from, with_one_ray
+from swarmsim.estimation.forward import Problem, ways_from
 from swarmsim.estimation.importance_sampling import Posterior, Weighed, sample_posterior
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
-from swarmsim.estimation.normal_equations import MEAN_FLOOR, Others, Unknowns, joint_equations, normal_equations
-from swarmsim.estimation.pairs import COMPANION_M, ONE_M
-from swarmsim.estimation.search import (
-    GOLDEN_ANGLE_RAD,
-    TOGETHER,
-    attempt,
-    bounds,
-    heard_most_at,
-    looked_at,
-    mirrored_place,
-    screen_of,
-    spread,
-)
-from swarmsim.estimation.seek import as_known, with_source
+from swarmsim.estimation.modes import modes_around
+from swarmsim.estimation.normal_equations import MEAN_FLOOR, joint_equations, normal_equations
+from swarmsim.estimation.search import attempt, bounds, heard_most_at
+from swarmsim.estimation.seek import with_source
 from swarmsim.estimation.state import ALONE_STEPS, State, without
-from swarmsim.estimation.weights import drawn_evenly, flattened
 from swarmsim.pytree import pytree
 
-SCOUTS = 96  # places at which the screen looks for further modes
-SCOUTED_M = 6.0  # two thirds of them within this distance of the source, the others up to three times as far
-HEIGHTS = 1.5  # standard deviations of the height within which they lie
-LEAST_SCOUTS = 8.0  # their weights are flattened until they count as this many
-MODES = 6  # of them that are looked at
-MOVES = 4  # Gauss-Newton steps of the place towards the mode beyond the way; the best of their places is taken
-LONGEST_MOVE_M = 1.0
+MODES = 96  # likely places by the screen, about which some are drawn
 NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 2  # Gauss-Newton steps at a place
 SWEEPS = 5  # over all sources, at most
 BETTER = 4.0  # in the logarithm of the likelihood, a place at which a source is taken to be from then on
 TOGETHER_M = 25.0  # sources nearer to one another are not known independently of one another
-PLACES_BESIDE = 24  # around a source, at which another one of its nuclide is thought of
-SHARE_BESIDE = 0.1  # of them, at which it may go unnoticed
 
 
 @pytree
@@ -70,7 +51,7 @@ class Sampled:
     """What is known of K sources; it means nothing where there is none."""
 
     posterior: Posterior  # [K] of each, the places of the others held
-    beside: jax.Array  # [K] information (1/Bq^2) about another one beside each (`_around`)
+    beside: jax.Array  # [K] information (1/Bq^2) about another one beside each (`modes_around`)
     state: State  # of the likeliest places
     moved: jax.Array  # [] bool: whether a likelier place was found still, from which not all were sampled again
 
@@ -171,57 +152,10 @@ def _posterior(
         )
 
     covariance = scaled_inverse(rate * s.towards[k] + jnp.diag(known))
-    modes, beside = some_at_a_time(lambda: _around(problem, state, k, others, u))
+    modes, beside = some_at_a_time(lambda: modes_around(problem, state, k, others, u, MODES))
     pivot = heard_most_at(problem, s.place[k], jnp.sum(state.added.counts[k], axis=1))
     off = problem.geometry_std_m
     return sample_posterior(weigh, s.place[k], covariance, rounds, per_round, modes, pivot, off), beside
-
-
-def _around(
-    problem: Problem, state: State, k: jax.Array, others: Others, u: Unknowns
-) -> tuple[jax.Array, jax.Array]:  # fmt: skip
-    """Places [m, 3] about which the posterior of source ``k`` may have further modes; what is known of one beside it.
-
-    Half of the places are likely ones of many all around, by the screen; the rest is the other side of the way. What
-    is known is the information [] (1/Bq^2) that the counts have about the activity of another source of its nuclide
-    beside it, at least `ONE_M` and at most `COMPANION_M` off, at nine of ten places.
-    """
-    place, nuclide = state.sources.place[k], state.sources.nuclide[k]
-    best = as_known(problem, state, k, jnp.array(False)).fit
-    screen = screen_of(problem, others, best.rates, nuclide, position_of(problem.site, place), best.unknowns)
-    quick = with_one_ray(problem)
-    scouts = spread(place, jnp.asarray(SCOUTED_M), HEIGHTS * problem.height_std_m, SCOUTS, jnp.zeros(()))
-    scouts = jnp.clip(jnp.concatenate([scouts, place + _ring()]), *bounds(problem))
-    seen, told = each(lambda x: looked_at(quick, screen, nuclide, x), scouts, TOGETHER)
-    likely = scouts[drawn_evenly(flattened(problem.learning_rate * seen[:SCOUTS], LEAST_SCOUTS), MODES)]
-    beside = jnp.sort(told[SCOUTS:])[int(SHARE_BESIDE * PLACES_BESIDE)]
-
-    def nearer(_: int, at: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        place, best, value = at
-        fit = attempt(problem, nuclide, others, u, place).fit
-        step = jnp.clip(jnp.nan_to_num(fit.move), -LONGEST_MOVE_M, LONGEST_MOVE_M)
-        return place + step, jnp.where(fit.value > value, place, best), jnp.maximum(fit.value, value)
-
-    mirrored = mirrored_place(problem, place, jnp.sum(state.added.counts[k], axis=1))
-    mirrored = jax.lax.fori_loop(0, MOVES, nearer, (mirrored, mirrored, -jnp.asarray(jnp.inf)))[1]
-    return in_pairs(likely, mirrored), beside
-
-
-def in_pairs(likely: jax.Array, mirrored: jax.Array) -> jax.Array:
-    """Two of the ``likely`` places [m, 3], twice the ``mirrored`` one [3], and so on [2 m, 3]; m is even.
-
-    `sample_posterior` draws about neighbours at different scales: so it does about either kind.
-    """
-    either = likely.reshape(-1, 2, 3), jnp.broadcast_to(mirrored, (likely.shape[0] // 2, 2, 3))
-    return jnp.concatenate(either, axis=1).reshape(-1, 3)
-
-
-def _ring() -> jax.Array:
-    """Offsets [`PLACES_BESIDE`, 3] to another source beside one, evenly over the area."""
-    index = jnp.arange(PLACES_BESIDE)
-    radius = jnp.sqrt(ONE_M**2 + (COMPANION_M**2 - ONE_M**2) * (index + 0.5) / PLACES_BESIDE)
-    angle = GOLDEN_ANGLE_RAD * index
-    return jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle), jnp.zeros(PLACES_BESIDE)], axis=-1)
 
 
 def goodness(problem: Problem, state: State) -> Goodness:

@@ -5,6 +5,9 @@ import jax.numpy as jnp
 
 # fractional parts of its multiples fill the unit interval evenly: the inverse of the root of x^4 = x + 1
 EVEN = 0.8191725
+# The same in the unit cube: powers of the root 1.2207 of that (Roberts, "The unreasonable effectiveness of quasirandom
+# sequences", 2018).
+_EVEN_3 = (EVEN, 0.6710436, 0.5497005)
 
 
 def normalised(log_weights: jax.Array, power: jax.Array | float = 1.0) -> jax.Array:
@@ -51,6 +54,12 @@ def drawn_evenly(weight: jax.Array, count: int) -> jax.Array:
     # neighbours in the order of the places have different scales
     turned = jnp.argsort(jnp.mod(jnp.arange(count) * EVEN, 1.0))
     return jnp.minimum(index, weight.shape[0] - 1)[turned]
+
+
+def even_normals(rounds: int, per_round: int, even: tuple[float, ...] = _EVEN_3) -> jax.Array:
+    """Standard normal numbers [rounds, per_round, 3] that fill space evenly; ``even`` makes another set of them."""
+    share = jnp.mod(0.5 + jnp.arange(1, rounds * per_round + 1)[:, None] * jnp.array(even), 1.0)
+    return jax.scipy.special.ndtri(jnp.clip(share, 1e-6, 1.0 - 1e-6)).reshape(rounds, per_round, 3)
 
 
 def moments(values: jax.Array, weight: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
 from swarmsim.estimation.importance_sampling import (
-    FIRST_SCALES,
     Weighed,
     _log_weights,
     _Normals,
@@ -20,7 +19,6 @@ from swarmsim.estimation.importance_sampling import (
     _worth,
     sample_posterior,
 )
-from swarmsim.estimation.posterior import in_pairs
 
 
 def weighed(place, log_posterior, log_activity=0.0, variance=0.0):
@@ -227,17 +225,36 @@ def test_places_far_apart_that_span_no_volume_do_not_end_sampling():
     assert float(jnp.min(found.effective)) > 2.0
 
 
-def test_modes_of_either_kind_are_drawn_about_at_several_scales():
-    """Of the places of a first round the odd ones are drawn about modes, in turn, and the scales are so as well."""
-    likely, mirrored = jnp.stack([1e3 * jnp.arange(1.0, 7.0)] * 3, axis=1), jnp.zeros(3)
-    modes = in_pairs(likely, mirrored)
-    index = np.arange(1, 24, 2)  # of a round's places, those about modes
-    of_mirrored = np.all(np.asarray(modes)[index // 2 % len(modes)] == 0.0, axis=1)
-    scale = np.array(FIRST_SCALES)[index % len(FIRST_SCALES)]
-    assert of_mirrored.sum() == 6
-    assert len(set(scale[of_mirrored])) > 1
-    assert len(set(scale[~of_mirrored])) > 1
-    assert sorted(set(np.asarray(modes)[:, 0].tolist())) == [0.0, *(1e3 * np.arange(1.0, 7.0)).tolist()]
+ROOM_M = jnp.array([3.0, 1.0, 0.5])
+
+
+@jax.jit
+@jax.vmap
+def _of_a_place_and_a_room(share, centre, modes):
+    """Moments of a place known to 0.3 m, at the origin, or anywhere in a room about ``centre`` by ``share``."""
+    volume = jnp.log(8.0 * jnp.prod(ROOM_M))
+
+    def weigh(x, _):
+        there = jnp.where(jnp.all(jnp.abs(x - centre) < ROOM_M), jnp.log(share) - volume, -jnp.inf)
+        here = jnp.log(1.0 - share) - 0.5 * jnp.sum(jnp.square(x / 0.3)) - 3.0 * jnp.log(0.3 * jnp.sqrt(2.0 * jnp.pi))
+        return weighed(x, jnp.logaddexp(here, there))
+
+    return sample_posterior(weigh, jnp.zeros(3), 0.09 * jnp.eye(3), 40, 24, modes)
+
+
+def test_of_modes_that_are_given_each_has_its_share_of_the_posterior():
+    """A source is where the search found it or in a building ten metres off: no place drawn about the one is there."""
+    rng = np.random.default_rng(3)
+    share, far = rng.uniform(0.15, 0.85, 48), rng.uniform(6.0, 15.0, (48, 3)) * rng.choice([-1.0, 1.0], (48, 3))
+    centre = np.array([1.0, 1.0, 0.0]) * far
+    inside = rng.random((48, 96, 1)) < 0.5 * (0.5 + share[:, None, None])  # as by a screen that is off
+    room = centre[:, None] + rng.uniform(-1.0, 1.0, (48, 96, 3)) * np.asarray(ROOM_M)
+    modes = np.where(inside, room, rng.normal(0.0, 0.3, (48, 96, 3)))
+    found = _of_a_place_and_a_room(*map(jnp.float32, (share, centre, modes)))
+    told = np.sum(np.asarray(found.mean)[:, :2] * centre[:, :2], axis=1) / np.sum(centre[:, :2] ** 2, axis=1)
+    assert np.std(told - share) < 0.08
+    assert abs(np.mean(told - share)) < 0.05
+    assert np.max(np.abs(told - share)) < 0.25
 
 
 @pytest.mark.parametrize("none", [-np.inf, np.nan])
