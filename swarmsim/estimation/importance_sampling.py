@@ -47,9 +47,9 @@ _EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
 # Between walls the posterior may be a needle that none of the others comes near.
 FIRST_SCALES = (4.2, 2.0, 1.0, 2.0, 2.0, 4.2, 1.0, 1.0, 0.02, 2.0, 2.0, 1.0)
 MODE_ROUNDS = 5  # in which half of the places lie about modes that are given; later a quarter do
-NEIGHBOUR = 6  # they are spread over modes as this one of their neighbours is away,
-OVERLAP = 0.6  # times this,
-MODE_STDS_M = (0.03, 0.6)  # at least and at most
+NEIGHBOURS = 8  # they are spread over modes as so many nearest ones of these are about each,
+OVERLAP = 0.8  # times this,
+WIDEST_MODE_M = 0.8  # at most
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 CLOSER = (1.0, 0.3, 0.1)  # the same in turn of those about the likeliest place, while a few outweigh all others
 FEW = 2.0  # so many
@@ -142,7 +142,7 @@ def sample_posterior(
     modes = jnp.zeros((0, 3)) if modes is None else modes
     normal, normal_off = even_normals(rounds, per_round), even_normals(rounds, per_round, _EVEN_OFF)
     first_scale, later_scale = (jnp.array(x)[index % len(x)] for x in (FIRST_SCALES, SCALES))
-    mode_std_m = jnp.clip(_spacing(modes), *MODE_STDS_M) if len(modes) else modes
+    shapes = _shapes(modes)
     local, errs = index % len(SCALES) >= ABOUT_MEAN, jnp.asarray(off_std_m) > 0.0
 
     def about_modes(done: _Rounds) -> jax.Array:
@@ -165,9 +165,8 @@ def sample_posterior(
         if len(modes) == 0:
             return centres, covariances
         number = (done.count * half + index // 2) % len(modes)
-        mode, std_m = modes[number], mode_std_m[number]
-        narrow, beside = jnp.square(std_m)[:, None, None] * jnp.eye(3), about_modes(done)[:, None]
-        return jnp.where(beside, mode, centres), jnp.where(beside[..., None], narrow, covariances)
+        beside = about_modes(done)[:, None]
+        return jnp.where(beside, modes[number], centres), jnp.where(beside[..., None], shapes[number], covariances)
 
     def round_(done: _Rounds) -> _Rounds:
         centres, covariances = placed(done)
@@ -191,10 +190,14 @@ def sample_posterior(
     return _summary(done, off_std_m)
 
 
-def _spacing(modes: jax.Array) -> jax.Array:
-    """Standard deviations [m] in m about ``modes`` [m, 3], by the distances between these: needles are narrow."""
-    apart = jnp.linalg.norm(modes[:, None] - modes, axis=-1)
-    return OVERLAP * jnp.sort(apart, axis=1)[:, min(NEIGHBOUR, len(modes) - 1)]
+def _shapes(modes: jax.Array) -> jax.Array:
+    """Covariances [m, 3, 3] about ``modes`` [m, 3], by the nearest of these: a needle's are narrow, a ridge's long."""
+    apart = modes[:, None] - modes
+    nearest = jnp.argsort(jnp.sum(jnp.square(apart), axis=-1), axis=1)[:, 1 : NEIGHBOURS + 1]
+    near = jnp.take_along_axis(apart, nearest[..., None], axis=1)
+    shape = OVERLAP**2 * jnp.einsum("mni,mnj->mij", near, near) / near.shape[1]
+    size = jnp.trace(shape, axis1=1, axis2=2)
+    return shape * jnp.minimum(1.0, WIDEST_MODE_M**2 / jnp.maximum(size, LEAST_STD_M**2))[:, None, None]
 
 
 def _of_off(

@@ -84,7 +84,7 @@ def _scouted(
         return (drawn, jax.scipy.special.logsumexp(jnp.log(weight) - 0.5 * off, axis=1)), (places, weight)
 
     draws = even_normals(CLOSER + 1, SCOUTS), CLOSING_IN ** jnp.arange(CLOSER + 1.0)
-    start = jnp.clip(around.at[-1].set(across), *limits), jnp.zeros(SCOUTS)
+    start = jnp.clip(around.at[0].set(place).at[-1].set(across), *limits), jnp.zeros(SCOUTS)
     places, weight = jax.tree.map(lambda x: x[-1], jax.lax.scan(step, start, draws)[1])
     return places[drawn_evenly(weight, count)]
 
