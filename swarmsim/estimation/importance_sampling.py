@@ -16,6 +16,8 @@ of those are of use. The others lie each along the ridge as it runs at a likely 
 Martino, Luengo and Corander, ICASSP 2015, 4075), as far as it is straight there. A source next to a place where a
 vehicle stood, or climbed, may lie in any direction from it, and all of a ring is likely: in the second round those
 places lie around the ring through the likeliest place so far, and if much of it is likely in every other round.
+Some places of each round lie about others that are given, likely ones in all modes that there may be
+(`swarmsim.estimation.modes`): what all earlier places are far from is never drawn otherwise.
 
 What all places are off by from the site's geometry is drawn with each of them: it moves the walls' shadows, which tell
 it in turn where they are sharp. Half of its draws follow what was likely so far, the others its prior.
@@ -47,9 +49,9 @@ _EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
 # Between walls the posterior may be a needle that none of the others comes near.
 FIRST_SCALES = (4.2, 2.0, 1.0, 2.0, 2.0, 4.2, 1.0, 1.0, 0.02, 2.0, 2.0, 1.0)
 MODE_ROUNDS = 5  # in which half of the places lie about modes that are given; later a quarter do
-NEIGHBOURS = 8  # they are spread over modes as so many nearest ones of these are about each,
+NEIGHBOURS = 8  # about each of which they are spread as so many of the nearest modes are,
 OVERLAP = 0.8  # times this,
-WIDEST_MODE_M = 0.8  # at most
+WIDEST_MODE_M = 0.8  # at most by this
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 CLOSER = (1.0, 0.3, 0.1)  # the same in turn of those about the likeliest place, while a few outweigh all others
 FEW = 2.0  # so many
@@ -195,7 +197,7 @@ def _shapes(modes: jax.Array) -> jax.Array:
     apart = modes[:, None] - modes
     nearest = jnp.argsort(jnp.sum(jnp.square(apart), axis=-1), axis=1)[:, 1 : NEIGHBOURS + 1]
     near = jnp.take_along_axis(apart, nearest[..., None], axis=1)
-    shape = OVERLAP**2 * jnp.einsum("mni,mnj->mij", near, near) / near.shape[1]
+    shape = OVERLAP**2 * jnp.einsum("mni,mnj->mij", near, near) / max(near.shape[1], 1)
     size = jnp.trace(shape, axis1=1, axis2=2)
     return shape * jnp.minimum(1.0, WIDEST_MODE_M**2 / jnp.maximum(size, LEAST_STD_M**2))[:, None, None]
 
