@@ -30,6 +30,18 @@ import jax.numpy as jnp
 
 from swarmsim.device import each, repeat_while
 from swarmsim.estimation.likelihood import scaled_inverse
+from swarmsim.estimation.mixture import (
+    Normals,
+    Rounds,
+    Weighed,
+    any_weight,
+    drawn_by,
+    likeliest_of,
+    log_weights_of,
+    nowhere,
+    with_round,
+    worth_of,
+)
 from swarmsim.estimation.search import TOGETHER
 from swarmsim.estimation.weights import (
     EVEN,
@@ -71,17 +83,6 @@ LEAST_SHARE = 1e-3  # standard deviation of a round in any direction, over that 
 
 
 @pytree
-class Weighed:
-    """Places and their posterior; leading axes of any shape."""
-
-    place: jax.Array  # [..., 3] x, y, height above the ground
-    log_activity: jax.Array  # [...] of the best fit there
-    variance: jax.Array  # [...] of the logarithm of the activity, the place held
-    log_posterior: jax.Array  # [...]
-    information: jax.Array  # [..., 3, 3] about the place, by the curvature there; as if nothing were in the way
-
-
-@pytree
 class Posterior:
     """Moments of (x, y, height above the ground, log activity in Bq)."""
 
@@ -90,28 +91,6 @@ class Posterior:
     effective: jax.Array  # [] number of independent places that the weighted ones are worth (`truncated`)
     halves: jax.Array  # [] distance between the means of two halves of the places, in standard deviations
     likeliest: jax.Array  # [3] of the places that were drawn
-
-
-@pytree
-class _Normals:
-    """Normal distributions of places, and of the error of all places over the standard deviation of its prior."""
-
-    centres: jax.Array  # [..., 3]
-    inverse: jax.Array  # [..., 3, 3] of the lower triangular root of the covariance
-    off: jax.Array  # [..., 3] mean of that at the centre
-    off_std: jax.Array  # [..., 3]
-    slope: jax.Array  # [..., 3, 3] change of that mean with the place
-
-
-@pytree
-class _Rounds:
-    """Places weighed so far, and the distributions that they were drawn from; Q rounds of P places."""
-
-    known: Weighed  # [Q, P]
-    off: jax.Array  # [Q, P, 3] error of all places, over the standard deviation of its prior
-    drawn_from: _Normals  # [Q, P]
-    mixture: jax.Array  # [Q, P] log density of all distributions together
-    count: jax.Array  # [] int32 rounds done
 
 
 def sample_posterior(
@@ -147,22 +126,22 @@ def sample_posterior(
     shapes = _shapes(modes)
     local, errs = index % len(SCALES) >= ABOUT_MEAN, jnp.asarray(off_std_m) > 0.0
 
-    def about_modes(done: _Rounds) -> jax.Array:
+    def about_modes(done: Rounds) -> jax.Array:
         """Which places [P] of the next round lie about modes."""
         of_four = index % 4
         return (len(modes) > 0) & ((of_four == 1) | ((of_four == 2) & (done.count < MODE_ROUNDS)))
 
-    def placed(done: _Rounds) -> tuple[jax.Array, jax.Array]:
+    def placed(done: Rounds) -> tuple[jax.Array, jax.Array]:
         """Centres [P, 3] and covariances [P, 3, 3] of the next round."""
-        first, weight = ~_any_weight(done), flattened(_log_weights(done), PLACED_EFFECTIVE)
+        first, weight = ~any_weight(done), flattened(log_weights_of(done), PLACED_EFFECTIVE)
         mean, about = moments(done.known.place, weight)
         places, ridges = _along_ridges(done, weight, about, local, pivot)
         centres = jnp.where(first, start, jnp.where(local[:, None], places, mean))
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
         # a tip that is much narrower than all that is known is closed in on
-        few = ~first & (worth(normalised(_log_weights(done))) < FEW)
+        few = ~first & (worth(normalised(log_weights_of(done))) < FEW)
         closer = jnp.where(few & local, jnp.array(CLOSER)[(index // len(SCALES)) % len(CLOSER)], 1.0)
-        centres = jnp.where((closer < 1.0)[:, None], _likeliest(done), centres)
+        centres = jnp.where((closer < 1.0)[:, None], likeliest_of(done), centres)
         covariances = jnp.square(jnp.where(first, first_scale, later_scale * closer))[:, None, None] * spread
         if len(modes) == 0:
             return centres, covariances
@@ -170,25 +149,25 @@ def sample_posterior(
         beside = about_modes(done)[:, None]
         return jnp.where(beside, modes[number], centres), jnp.where(beside[..., None], shapes[number], covariances)
 
-    def round_(done: _Rounds) -> _Rounds:
+    def round_(done: Rounds) -> Rounds:
         centres, covariances = placed(done)
         roots = jnp.linalg.cholesky(covariances + _least(covariances))
         eye = jnp.broadcast_to(jnp.eye(3), roots.shape)
         inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
-        modes_, later = about_modes(done), _any_weight(done)
+        modes_, later = about_modes(done), any_weight(done)
         exact = (modes_ | (first_scale < 1.0)) & (done.count == 0)
         mean, std, slope = _of_off(done, centres, errs & exact, errs & later & (index % 2 == 1))
-        drawn_from = _Normals(centres=centres, inverse=inverse, off=mean, off_std=std, slope=slope)
+        drawn_from = Normals(centres=centres, inverse=inverse, off=mean, off_std=std, slope=slope)
         aside = jnp.einsum("pij,pj->pi", roots, normal[done.count])
         places, off = centres + aside, mean + jnp.einsum("pij,pj->pi", slope, aside) + std * normal_off[done.count]
         drawn = each(lambda x: weigh(*x), (places, off_std_m * off), TOGETHER)
-        return _with_round(done, drawn, off, drawn_from)
+        return with_round(done, drawn, off, drawn_from)
 
-    def more(done: _Rounds) -> jax.Array:
-        enough = _worth(done) >= ENOUGH_EFFECTIVE
+    def more(done: Rounds) -> jax.Array:
+        enough = worth_of(done) >= ENOUGH_EFFECTIVE
         return (done.count < rounds) & ~(enough & (done.count >= LEAST_ROUNDS))
 
-    done = repeat_while(more, round_, _nowhere(rounds, per_round))
+    done = repeat_while(more, round_, nowhere(rounds, per_round))
     return _summary(done, off_std_m)
 
 
@@ -203,16 +182,16 @@ def _shapes(modes: jax.Array) -> jax.Array:
 
 
 def _of_off(
-    done: _Rounds, centres: jax.Array, exact: jax.Array, adapted: jax.Array
+    done: Rounds, centres: jax.Array, exact: jax.Array, adapted: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:  # fmt: skip
-    """The error of all places in the next round, about ``centres`` [P, 3]: see `_Normals`.
+    """The error of all places in the next round, about ``centres`` [P, 3]: see `Normals`.
 
     That of its prior; but next to none for those that are ``exact`` [P], and for the ``adapted`` [P] as it was likely
     so far. Walls tell where a source is on the site and distances where it is to the vehicles, so that the error
     follows from the place where both are sharp.
     """
     both = jnp.concatenate([done.known.place, done.off], axis=-1)
-    mean, covariance = moments(both, flattened(_log_weights(done), OFF_EFFECTIVE))
+    mean, covariance = moments(both, flattened(log_weights_of(done), OFF_EFFECTIVE))
     of_place, across, own = covariance[:3, :3], covariance[3:, :3], jnp.diagonal(covariance)[3:]
     slope = across @ scaled_inverse(of_place * (1.0 + SHRUNK * jnp.eye(3)) + _least(of_place))
     left = own - jnp.sum(slope * across, axis=1)
@@ -232,28 +211,8 @@ def _least(covariance: jax.Array) -> jax.Array:
     return least[..., None, None] * jnp.eye(3)
 
 
-def _nowhere(rounds: int, per_round: int) -> _Rounds:
-    """No round yet: the places of those to come have no weight, and their distributions no density."""
-    none, eye = jnp.zeros((rounds, per_round)), jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
-    empty = Weighed(
-        place=jnp.zeros((rounds, per_round, 3)),
-        log_activity=none,
-        variance=none,
-        log_posterior=jnp.full((rounds, per_round), -jnp.inf),
-        information=eye,
-    )
-    places = empty.place
-    return _Rounds(
-        known=empty,
-        off=places,
-        drawn_from=_Normals(centres=places, inverse=eye, off=places, off_std=jnp.ones_like(places), slope=0.0 * eye),
-        mixture=empty.log_posterior,
-        count=jnp.int32(0),
-    )
-
-
 def _along_ridges(
-    done: _Rounds, weight: jax.Array, about: jax.Array, local: jax.Array, pivot: jax.Array | None
+    done: Rounds, weight: jax.Array, about: jax.Array, local: jax.Array, pivot: jax.Array | None
 ) -> tuple[jax.Array, jax.Array]:  # fmt: skip
     """Likely places [P, 3] and covariances [P, 3, 3] of their ridges, to draw about; turned around a ring.
 
@@ -304,8 +263,8 @@ def _turned(
     return pivot + jnp.einsum("ijp,pj->pi", turn, offset), jnp.einsum("ijp,pjk,lkp->pil", turn, covariances, turn)
 
 
-def _summary(done: _Rounds, off_std_m: jax.Array | float) -> Posterior:
-    known, log_weights = done.known, _log_weights(done)
+def _summary(done: Rounds, off_std_m: jax.Array | float) -> Posterior:
+    known, log_weights = done.known, log_weights_of(done)
     weight = flattened(log_weights, LEAST_EFFECTIVE)
     values = jnp.concatenate([known.place - off_std_m * done.off, known.log_activity[..., None]], axis=-1)
     mean, covariance = moments(values, weight)
@@ -313,9 +272,9 @@ def _summary(done: _Rounds, off_std_m: jax.Array | float) -> Posterior:
     return Posterior(
         mean=mean,
         covariance=covariance,
-        effective=_worth(done),
-        halves=_halves(values, log_weights, covariance, _drawn(done)),
-        likeliest=_likeliest(done),
+        effective=worth_of(done),
+        halves=_halves(values, log_weights, covariance, drawn_by(done)),
+        likeliest=likeliest_of(done),
     )
 
 
@@ -331,76 +290,3 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, dr
     ]
     apart = jnp.abs(means[0] - means[1])[:2] / jnp.sqrt(jnp.maximum(jnp.diagonal(covariance)[:2], LEAST_STD_M**2))
     return jnp.max(apart)
-
-
-def _with_round(done: _Rounds, drawn: Weighed, off: jax.Array, drawn_from: _Normals) -> _Rounds:
-    """The rounds and one more: places [P], the error [P, 3] of all places, and what both were drawn from [P]."""
-    k = done.count
-    known, every, all_off = (
-        jax.tree.map(lambda all_, new: all_.at[k].set(new), *x)
-        for x in ((done.known, drawn), (done.drawn_from, drawn_from), (done.off, off))
-    )
-    # the new distributions at all places, and those before them at the new places: the rest is known
-    places = known.place.reshape(-1, 3)
-    of_new = _log_density(places, all_off.reshape(-1, 3), places[0], drawn_from).reshape(known.log_posterior.shape)
-    earlier = jnp.repeat(jnp.arange(len(done.off)) < k, len(off))
-    flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), done.drawn_from)
-    before = _log_density(drawn.place, off, places[0], flat, earlier)
-    mixture = done.mixture.at[k].set(before)
-    return _Rounds(
-        known=known,
-        off=all_off,
-        drawn_from=every,
-        mixture=jnp.logaddexp(mixture, of_new),
-        count=k + 1,
-    )
-
-
-def _log_density(
-    places: jax.Array, off: jax.Array, origin: jax.Array, of: _Normals, drawn: jax.Array | bool = True
-) -> jax.Array:
-    """Log density [m] at ``places`` [m, 3] that are ``off`` [m, 3], of those of [n] that are ``drawn`` [n] from.
-
-    Up to a constant. Places and centres are taken relative to ``origin`` [3]: large coordinates would lose digits in
-    float32.
-    """
-    offset = (places - origin)[:, None] - (of.centres - origin)
-    turned = [sum(of.inverse[:, i, j] * offset[..., j] for j in range(i + 1)) for i in range(3)]
-    left = [
-        off[:, i, None] - of.off[:, i] - sum(of.slope[:, i, j] * offset[..., j] for j in range(3)) for i in range(3)
-    ]
-    turned += [left[i] / of.off_std[:, i] for i in range(3)]
-    sharp = jnp.sum(jnp.log(jnp.diagonal(of.inverse, axis1=1, axis2=2)) - jnp.log(of.off_std), axis=1)
-    each_ = sharp - 0.5 * sum(jnp.square(x) for x in turned)
-    return jax.scipy.special.logsumexp(jnp.where(drawn, each_, -jnp.inf), axis=1)
-
-
-def _log_weights(done: _Rounds) -> jax.Array:
-    """Logarithms [Q, P] of posterior over mixture of the distributions of all rounds so far."""
-    weight = _log_posterior(done) - done.mixture
-    return jnp.where(jnp.isfinite(weight), weight, -jnp.inf)
-
-
-def _log_posterior(done: _Rounds) -> jax.Array:
-    """Logarithms [Q, P] of the posterior at each place, by what all places are off there."""
-    return done.known.log_posterior - 0.5 * jnp.sum(jnp.square(done.off), axis=-1)
-
-
-def _likeliest(done: _Rounds) -> jax.Array:
-    """The likeliest place [3] so far."""
-    return done.known.place.reshape(-1, 3)[jnp.argmax(_log_posterior(done))]
-
-
-def _any_weight(done: _Rounds) -> jax.Array:
-    """Whether [] a place that the posterior does not rule out has been found."""
-    return jnp.any(jnp.isfinite(_log_weights(done)))
-
-
-def _worth(done: _Rounds) -> jax.Array:
-    """How many independent places [] the weighted ones are worth."""
-    return jnp.where(_any_weight(done), worth(truncated(_log_weights(done), _drawn(done))), 0.0)
-
-
-def _drawn(done: _Rounds) -> jax.Array:
-    """Number [] of places drawn so far."""
-    return (done.count * done.mixture.shape[1]).astype(jnp.float32)

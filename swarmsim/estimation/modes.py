@@ -1,9 +1,9 @@
 """Where the posterior of a source may have modes besides the one that the search has found.
 
 Between walls it has many, decimetres wide and metres apart. The screen of `swarmsim.estimation.search`, one ray to a
-window and no fit, agrees with fits to one or two in the logarithm within metres of the source, for a hundredth of the
-price: hundreds of places are screened all around, and again, ever closer, about those that are likely (population Monte
-Carlo: Cappé, Guillin, Marin and Robert, Journal of Computational and Graphical Statistics 13, 2004, 907).
+window and no fit, agrees with fits to one or two in the logarithm within metres of the source: hundreds of places are
+screened all around, and again, ever closer, about those that are likely (population Monte Carlo: Cappé, Guillin, Marin
+and Robert, Journal of Computational and Graphical Statistics 13, 2004, 907).
 """
 
 import jax

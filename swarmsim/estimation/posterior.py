@@ -20,8 +20,9 @@ import jax.numpy as jnp
 from swarmsim.device import IN_STEP, for_those, repeat_while, some_at_a_time
 from swarmsim.estimation.fit import alone, settle
 from swarmsim.estimation.forward import Problem, ways_from
-from swarmsim.estimation.importance_sampling import Posterior, Weighed, sample_posterior
+from swarmsim.estimation.importance_sampling import Posterior, sample_posterior
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
+from swarmsim.estimation.mixture import Weighed
 from swarmsim.estimation.modes import modes_around
 from swarmsim.estimation.normal_equations import MEAN_FLOOR, joint_equations, normal_equations
 from swarmsim.estimation.search import attempt, bounds, heard_most_at

@@ -10,15 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
-from swarmsim.estimation.importance_sampling import (
-    Weighed,
-    _log_weights,
-    _Normals,
-    _Rounds,
-    _with_round,
-    _worth,
-    sample_posterior,
-)
+from swarmsim.estimation.importance_sampling import sample_posterior
+from swarmsim.estimation.mixture import Normals, Rounds, Weighed, log_weights_of, with_round, worth_of
 
 
 def weighed(place, log_posterior, log_activity=0.0, variance=0.0):
@@ -187,9 +180,9 @@ def test_a_few_places_that_outweigh_all_others_are_not_worth_many():
     eye = jnp.broadcast_to(jnp.eye(3), (40, 24, 3, 3))
     known = replace(weighed(jnp.zeros((40, 24, 3)), jnp.float32(value), zero, zero), information=eye)
     off = jnp.zeros((40, 24, 3))
-    drawn_from = _Normals(centres=known.place, inverse=eye, off=off, off_std=off + 1.0, slope=0.0 * eye)
-    done = _Rounds(known=known, off=off, drawn_from=drawn_from, mixture=zero, count=jnp.int32(5))
-    assert float(_worth(done)) < 5.0
+    drawn_from = Normals(centres=known.place, inverse=eye, off=off, off_std=off + 1.0, slope=0.0 * eye)
+    done = Rounds(known=known, off=off, drawn_from=drawn_from, mixture=zero, count=jnp.int32(5))
+    assert float(worth_of(done)) < 5.0
 
 
 @jax.jit
@@ -291,8 +284,8 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
     eye = jnp.broadcast_to(jnp.eye(3), (rounds, per_round, 3, 3))
     empty = replace(weighed(jnp.zeros((rounds, per_round, 3)), none - jnp.inf, none, none), information=eye)
     zero = empty.place
-    nothing = _Normals(centres=zero, inverse=eye, off=zero, off_std=zero + 1.0, slope=0.0 * eye)
-    done = _Rounds(known=empty, off=zero, drawn_from=nothing, mixture=none - jnp.inf, count=jnp.int32(0))
+    nothing = Normals(centres=zero, inverse=eye, off=zero, off_std=zero + 1.0, slope=0.0 * eye)
+    done = Rounds(known=empty, off=zero, drawn_from=nothing, mixture=none - jnp.inf, count=jnp.int32(0))
     places, centres, roots, offs, off_means, off_stds, slopes = [], [], [], [], [], [], []
     for _ in range(drawn):
         # far from the origin of the site, and from one round to the next
@@ -307,14 +300,14 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
         inverse = np.linalg.inv(roots[-1])
         from_ = [jnp.asarray(x) for x in (centres[-1], inverse, off_means[-1], off_stds[-1], slopes[-1])]
         from_ = dict(zip(("centres", "inverse", "off", "off_std", "slope"), from_, strict=True))
-        done = _with_round(done, new, jnp.asarray(offs[-1]), _Normals(**from_))
+        done = with_round(done, new, jnp.asarray(offs[-1]), Normals(**from_))
     at, off = np.concatenate(places).astype(np.float64), np.concatenate(offs)
     density = np.zeros(len(at))
     every = [np.concatenate(x).astype(np.float64) for x in (centres, roots, off_means, off_stds, slopes)]
     for c, root, mean, std, slope in zip(*every, strict=True):
         about = norm(mean + (at - c) @ slope.T, std)
         density += multivariate_normal(c, root @ root.T).pdf(at) * about.pdf(off).prod(axis=1)
-    weights = np.asarray(_log_weights(done))
+    weights = np.asarray(log_weights_of(done))
     found, expected = weights[:drawn].reshape(-1), 1.0 + norm.logpdf(off).sum(axis=1) - np.log(density)
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=2e-3)
     assert np.all(weights[drawn:] == -np.inf)
