@@ -111,9 +111,7 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
     unit = at.information / (scale[:, None] * scale) + 1e-6 * jnp.eye(scale.shape[0])
     root = jax.scipy.linalg.cholesky(unit, lower=True)
     log_volume = -jnp.sum(jnp.log(jnp.diagonal(root))) - jnp.sum(jnp.log(scale))
-    # where nothing is left of an activity its logarithm says nothing
-    excess = (jnp.log(jnp.maximum(u.activity_bq, 1.0)) - problem.log_activity) / problem.log_activity_std
-    value = likelihood + log_volume + at.log_volume - 0.5 * jnp.square(excess)
+    value = likelihood + log_volume + at.log_volume + log_prior_of_activity(problem, u.activity_bq)
     possible = u.activity_bq <= 1e6 * ACTIVITY_MAX_MBQ
     return Settled(
         value=jnp.where(possible & jnp.isfinite(value), value, -jnp.inf),
@@ -124,6 +122,13 @@ def _settled(problem: Problem, model: Linearised, u: Unknowns, ways: Ways, sourc
         move=scaled_inverse(towards + jnp.eye(3) * FLAT) @ pull,
         rates=source,
     )
+
+
+def log_prior_of_activity(problem: Problem, activity_bq: jax.Array) -> jax.Array:
+    """Log prior [] of an activity, up to a constant."""
+    # where nothing is left of an activity its logarithm says nothing
+    excess = (jnp.log(jnp.maximum(activity_bq, 1.0)) - problem.log_activity) / problem.log_activity_std
+    return -0.5 * jnp.square(excess)
 
 
 def _begun(problem: Problem, source: Rates, others: Others, where: jax.Array, u: Unknowns) -> Unknowns:

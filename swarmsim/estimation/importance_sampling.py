@@ -62,8 +62,10 @@ _EVEN_OFF = (0.6521828, 0.5860865, 0.5266888)
 FIRST_SCALES = (4.2, 2.0, 1.0, 2.0, 2.0, 4.2, 1.0, 1.0, 0.02, 2.0, 2.0, 1.0)
 MODE_ROUNDS = 5  # in which half of the places lie about modes that are given; later a quarter do
 NEIGHBOURS = 8  # about each of which they are spread as so many of the nearest modes are,
+NEIGHBOUR_M = 2.4  # those within this distance,
 OVERLAP = 0.8  # times this,
 WIDEST_MODE_M = 0.8  # at most by this
+BLUNT_M = 0.1  # and at least by this about every other one
 SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
 CLOSER = (1.0, 0.3, 0.1)  # the same in turn of those about the likeliest place, while a few outweigh all others
 FEW = 2.0  # so many
@@ -77,7 +79,8 @@ LEAST_ROUNDS = 5
 LEAST_STD_M = 1e-3
 OFF_WIDER = 1.2  # standard deviations of the error of all places that are drawn, over those so far
 LEAST_OFF = 0.1  # of its prior's
-OFF_EFFECTIVE = 16.0  # weights are flattened until they count as this many for its distribution
+OFF_EFFECTIVE = 40.0  # weights are flattened until they count as this many for its distribution
+OFF_NEAR_M = 2.0  # standard deviation of the distance within which places count for it: each mode has one of its own
 SHRUNK = 0.1  # of the variance of places, by which what the error follows from them is lessened
 LEAST_SHARE = 1e-3  # standard deviation of a round in any direction, over that in all: two places far apart span one
 
@@ -119,7 +122,7 @@ def sample_posterior(
         pivot: [3] around which what is likely may lie on a ring; without one ridges are taken to be straight.
         off_std_m: [] standard deviation of the error.
     """
-    index, half = jnp.arange(per_round), per_round // 2
+    index, quarter = jnp.arange(per_round), per_round // 4
     modes = jnp.zeros((0, 3)) if modes is None else modes
     normal, normal_off = even_normals(rounds, per_round), even_normals(rounds, per_round, _EVEN_OFF)
     first_scale, later_scale = (jnp.array(x)[index % len(x)] for x in (FIRST_SCALES, SCALES))
@@ -145,8 +148,11 @@ def sample_posterior(
         covariances = jnp.square(jnp.where(first, first_scale, later_scale * closer))[:, None, None] * spread
         if len(modes) == 0:
             return centres, covariances
-        number = (done.count * half + index // 2) % len(modes)
         beside = about_modes(done)[:, None]
+        before = (
+            jnp.minimum(done.count, MODE_ROUNDS) * (2 * quarter) + jnp.maximum(done.count - MODE_ROUNDS, 0) * quarter
+        )
+        number = (before + jnp.cumsum(beside[:, 0]) - 1) % len(modes)
         return jnp.where(beside, modes[number], centres), jnp.where(beside[..., None], shapes[number], covariances)
 
     def round_(done: Rounds) -> Rounds:
@@ -172,13 +178,26 @@ def sample_posterior(
 
 
 def _shapes(modes: jax.Array) -> jax.Array:
-    """Covariances [m, 3, 3] about ``modes`` [m, 3], by the nearest of these: a needle's are narrow, a ridge's long."""
+    """Covariances [m, 3, 3] about ``modes`` [m, 3], by the nearest of these: a needle's are narrow, a ridge's long.
+
+    A mode that is given several times is one neighbour of others, and none of itself: what is drawn about it is as wide
+    as the region that it stands for.
+    """
+    number = jnp.arange(len(modes))
     apart = modes[:, None] - modes
-    nearest = jnp.argsort(jnp.sum(jnp.square(apart), axis=-1), axis=1)[:, 1 : NEIGHBOURS + 1]
-    near = jnp.take_along_axis(apart, nearest[..., None], axis=1)
-    shape = OVERLAP**2 * jnp.einsum("mni,mnj->mij", near, near) / max(near.shape[1], 1)
+    squared = jnp.sum(jnp.square(apart), axis=-1)
+    same = squared < LEAST_STD_M**2
+    again = jnp.any(same & (number[:, None] > number), axis=1)
+    far = jnp.where(same | again, jnp.inf, squared)
+    nearest = jnp.argsort(far, axis=1)[:, :NEIGHBOURS]
+    used = jnp.take_along_axis(far, nearest, axis=1) < NEIGHBOUR_M**2
+    near = jnp.where(used[..., None], jnp.take_along_axis(apart, nearest[..., None], axis=1), 0.0)
+    count = jnp.maximum(jnp.sum(used, axis=1), 1)[:, None, None]
+    shape = OVERLAP**2 * jnp.einsum("mni,mnj->mij", near, near) / count
     size = jnp.trace(shape, axis1=1, axis2=2)
-    return shape * jnp.minimum(1.0, WIDEST_MODE_M**2 / jnp.maximum(size, LEAST_STD_M**2))[:, None, None]
+    shape = shape * jnp.minimum(1.0, WIDEST_MODE_M**2 / jnp.maximum(size, LEAST_STD_M**2))[:, None, None]
+    blunt = jnp.where(number % 2 == 0, BLUNT_M**2, 0.0)
+    return shape + blunt[:, None, None] * jnp.eye(3)
 
 
 def _of_off(
@@ -187,19 +206,26 @@ def _of_off(
     """The error of all places in the next round, about ``centres`` [P, 3]: see `Normals`.
 
     That of its prior; but next to none for those that are ``exact`` [P], and for the ``adapted`` [P] as it was likely
-    so far. Walls tell where a source is on the site and distances where it is to the vehicles, so that the error
-    follows from the place where both are sharp.
+    near them so far. Walls tell where a source is on the site and distances where it is to the vehicles, so that the
+    error follows from the place where both are sharp, about each mode in another way.
     """
-    both = jnp.concatenate([done.known.place, done.off], axis=-1)
-    mean, covariance = moments(both, flattened(log_weights_of(done), OFF_EFFECTIVE))
-    of_place, across, own = covariance[:3, :3], covariance[3:, :3], jnp.diagonal(covariance)[3:]
-    slope = across @ scaled_inverse(of_place * (1.0 + SHRUNK * jnp.eye(3)) + _least(of_place))
-    left = own - jnp.sum(slope * across, axis=1)
-    std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(left, 0.0)), LEAST_OFF, 1.0)
-    at = mean[3:] + (centres - mean[:3]) @ slope.T
+    both, log_weights = jnp.concatenate([done.known.place, done.off], axis=-1), log_weights_of(done)
+    flat = jnp.log(flattened(log_weights, OFF_EFFECTIVE))
+
+    def of(centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Mean [3], standard deviation [3] and slope [3, 3] of the error about a ``centre`` [3], as was likely."""
+        near = -0.5 * jnp.sum(jnp.square((done.known.place - centre) / OFF_NEAR_M), axis=-1)
+        mean, covariance = moments(both, flattened(flat + near, OFF_EFFECTIVE))
+        of_place, across, own = covariance[:3, :3], covariance[3:, :3], jnp.diagonal(covariance)[3:]
+        slope = across @ scaled_inverse(of_place * (1.0 + SHRUNK * jnp.eye(3)) + _least(of_place))
+        left = own - jnp.sum(slope * across, axis=1)
+        std = jnp.clip(OFF_WIDER * jnp.sqrt(jnp.maximum(left, 0.0)), LEAST_OFF, 1.0)
+        return mean[3:] + slope @ (centre - mean[:3]), std, slope
+
+    mean, std, slope = jax.vmap(of)(centres)
     adapted, exact = adapted[:, None], exact[:, None]
     return (
-        jnp.where(adapted, at, 0.0),
+        jnp.where(adapted, mean, 0.0),
         jnp.where(adapted, std, jnp.where(exact, LEAST_OFF, 1.0)),
         jnp.where(adapted[..., None], slope, 0.0),
     )

@@ -35,6 +35,7 @@ WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one a
 CONVERGED_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
 UNSURE = 0.25  # standard deviation of a place whose posterior could not be sampled, over the reach of the search
+UNSURE_ACTIVITY = 0.5  # the same of the logarithm of its activity
 
 
 @pytree
@@ -223,8 +224,8 @@ def sampled(
     covariance = jnp.where(sound[:, None, None], posterior.covariance, wide)
     converged = sound & (posterior.effective >= CONVERGED_EFFECTIVE) & (posterior.halves <= HALVES_AGREE)
     # too few places to tell their spread: it must not look small
-    unsure = jnp.where(converged, 0.0, jnp.square(UNSURE * reach))
-    return converged, mean, covariance + unsure[:, None, None] * jnp.diag(jnp.array([1.0, 1.0, 0.0, 0.0]))
+    unsure = jnp.square(jnp.stack([UNSURE * reach, UNSURE * reach, jnp.zeros(()), jnp.asarray(UNSURE_ACTIVITY)]))
+    return converged, mean, covariance + jnp.where(converged[:, None, None], 0.0, jnp.diag(unsure))
 
 
 def _report(

@@ -30,7 +30,7 @@ from swarmsim.estimation.seek import as_known
 from swarmsim.estimation.state import State
 from swarmsim.estimation.weights import drawn_evenly, even_normals, flattened
 
-SCOUTS = 192  # places that are screened at once
+SCOUTS = 384  # places that are screened at once
 SCOUTED_M = 8.0  # two thirds of them within this distance of the source, the others up to three times as far
 HEIGHTS = 1.5  # standard deviations of the height within which they lie
 CLOSER = 2  # times that as many are screened about the likely ones

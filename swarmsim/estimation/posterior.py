@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from swarmsim.device import IN_STEP, for_those, repeat_while, some_at_a_time
-from swarmsim.estimation.fit import alone, settle
+from swarmsim.estimation.fit import alone, log_prior_of_activity, settle
 from swarmsim.estimation.forward import Problem, ways_from
 from swarmsim.estimation.importance_sampling import Posterior, sample_posterior
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
@@ -142,13 +142,15 @@ def _posterior(
 
     def weigh(place: jax.Array, off_m: jax.Array) -> Weighed:
         fit = settle(problem, ways_from(problem, place, off_m), nuclide, others, u, WEIGH_STEPS, exact=False)
-        of_height = 0.5 * height_precision(problem.height_std_m) * jnp.square(place[2] - problem.height_m)
+        # it is the likelihood that counts less often; the priors, which the value holds as well, count in full
+        priors = -0.5 * height_precision(problem.height_std_m) * jnp.square(place[2] - problem.height_m)
+        priors += log_prior_of_activity(problem, fit.unknowns.activity_bq)
         inside = jnp.all((place >= limits[0]) & (place <= limits[1]))
         return Weighed(
             place=place,
             log_activity=jnp.log(jnp.maximum(fit.unknowns.activity_bq, 1e-3)),
             variance=fit.covariance[0, 0] / rate,
-            log_posterior=jnp.where(inside, rate * fit.value - (1.0 - rate) * of_height, -jnp.inf),
+            log_posterior=jnp.where(inside, rate * fit.value + (1.0 - rate) * priors, -jnp.inf),
             information=rate * fit.towards + jnp.diag(known),
         )
 
