@@ -88,17 +88,22 @@ def _faces(grid: Grid, corners: Floats) -> Iterator[tuple[Integers, Floats, Inte
         start, end = _ends(points[of], row)
         left, right = (x[:, 0] for x in _between(start[:, None], end[:, None], grid))
         for several in _chunks(np.flatnonzero(right >= left), right - left + 1):
-            line, column = _runs(left[several], right[several])
-            line = several[line]
-            triangle, rows = of[line], row[line]
-            offset = np.stack([column, rows], axis=-1) - points[triangle, 0]
-            u = (offset[:, 0] * second[triangle, 1] - offset[:, 1] * second[triangle, 0]) / doubled_area[triangle]
-            v = (first[triangle, 0] * offset[:, 1] - first[triangle, 1] * offset[:, 0]) / doubled_area[triangle]
-            hit = (u >= -_TOLERANCE) & (v >= -_TOLERANCE) & (u + v <= 1.0 + _TOLERANCE)
-            triangle, u, v = triangle[hit], u[hit], v[hit]
-            z = corners[triangle, :, 2]
-            height = z[:, 0] + u * (z[:, 1] - z[:, 0]) + v * (z[:, 2] - z[:, 0])
-            yield (rows * grid.nx + column)[hit], height, triangle
+            # along a row all of them change evenly
+            at, count = of[several], right[several] - left[several] + 1
+            east, north = left[several] - points[at, 0, 0], row[several] - points[at, 0, 1]
+            x, y, area = first[at], second[at], doubled_area[at]
+            rise = corners[at, 1:, 2] - corners[at, :1, 2]
+            u, along_u = (east * y[:, 1] - north * y[:, 0]) / area, y[:, 1] / area
+            v, along_v = (x[:, 0] * north - x[:, 1] * east) / area, -x[:, 1] / area
+            step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+            u, v = (
+                np.repeat(start, count) + np.repeat(each, count) * step for start, each in ((u, along_u), (v, along_v))
+            )
+            hit = np.flatnonzero((u >= -_TOLERANCE) & (v >= -_TOLERANCE) & (u + v <= 1.0 + _TOLERANCE))
+            line = np.repeat(np.arange(len(several)), count)[hit]
+            height = corners[at, 0, 2][line] + u[hit] * rise[line, 0] + v[hit] * rise[line, 1]
+            cell = (row[several] * grid.nx + left[several])[line] + step[hit]
+            yield cell, height, at[line]
 
 
 def _between(low: Floats, high: Floats, grid: Grid) -> tuple[Integers, Integers]:
@@ -165,13 +170,12 @@ def surface_points(corners: Floats, spacing: float) -> Iterator[Floats]:
     pieces = np.maximum(np.ceil(np.linalg.norm(sides, axis=-1) / spacing).astype(np.int64), 1)
     count = (pieces + 1).prod(axis=1)
     for part in _chunks(np.arange(len(corners)), count):
-        triangle = np.repeat(part, count[part])
-        within = np.arange(len(triangle)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
-        across = pieces[triangle, 0] + 1
-        u, v = (within % across) / pieces[triangle, 0], (within // across) / pieces[triangle, 1]
-        kept = u + v <= 1.0 + 1e-9
-        triangle, u, v = triangle[kept], u[kept], v[kept]
-        yield ordered[triangle, 0] + u[:, None] * sides[triangle, 0] + v[:, None] * sides[triangle, 1]
+        row, along = _runs(np.zeros_like(part), pieces[part, 1])
+        triangle = part[row]
+        v = along / pieces[triangle, 1]
+        line, step = _runs(np.zeros_like(triangle), np.floor(pieces[triangle, 0] * (1.0 - v + 1e-9)).astype(np.int64))
+        start = ordered[triangle, 0] + v[:, None] * sides[triangle, 1]
+        yield start[line] + step[:, None] * (sides[triangle, 0] / pieces[triangle, :1])[line]
     for start in range(0, len(corners), 20_000):
         yield edge_points(corners[start : start + 20_000], spacing)[0]
 
