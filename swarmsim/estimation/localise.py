@@ -25,8 +25,8 @@ from swarmsim.estimation.posterior import goodness, of_others, posteriors
 from swarmsim.estimation.presumed import Presumed
 from swarmsim.estimation.scan import true_counts
 from swarmsim.estimation.seek import SearchParams
-from swarmsim.estimation.sources import find_sources
-from swarmsim.estimation.state import Sources, State, no_sources, ratios
+from swarmsim.estimation.sources import find_sources, needed
+from swarmsim.estimation.state import Sources, State, no_sources
 from swarmsim.pytree import on_host, pytree, static
 from swarmsim.site import sample
 
@@ -235,8 +235,8 @@ def _report(
     of_all = posteriors(problem, state, params.sample_rounds, params.samples)
     posterior, state = of_all.posterior, of_all.state
     posterior = replace(posterior, effective=jnp.where(of_all.moved, 0.0, posterior.effective))
+    state, detection = needed(problem, params.search, state)
     s, overall = state.sources, goodness(problem, state)
-    detection = ratios(problem, state)
     converged, mean, covariance = sampled(presumed, params, s, posterior)
     more = of_others(problem, state)
     sound = jnp.isfinite(more).all(axis=(1, 2))

@@ -111,6 +111,26 @@ def _believed(problem: Problem, params: SearchParams, state: State) -> State:
     return for_those(jnp.sum(state.sources.present) == 1, judged, lambda: state)
 
 
+def needed(problem: Problem, params: SearchParams, state: State) -> tuple[State, jax.Array]:
+    """The state without those beside others that are not missed; and each one's likelihood ratio [K] (`ratios`).
+
+    Where sampling has moved a source it may explain what another one stood for. The one that is missed least is taken
+    away first.
+    """
+
+    def look(known: tuple[State, jax.Array, jax.Array]) -> tuple[State, jax.Array, jax.Array]:
+        state, _, _ = known
+        present, ratio = state.sources.present, ratios(problem, state)
+        k = jnp.argmin(jnp.where(present, ratio, jnp.inf))
+        needless = (jnp.sum(present) > 1) & (ratio[k] < HOPELESS * params.further)
+        left = for_those(needless, lambda: settled(problem, without(state, k)), lambda: state)
+        return left, ratio, needless
+
+    start = state, jnp.zeros(state.sources.present.shape[0]), jnp.array(True)
+    state, ratio, _ = repeat_while(lambda known: known[2], look, start)
+    return state, ratio
+
+
 def _divided(problem: Problem, params: SearchParams, p: _Progress) -> _Progress:
     """Two sources in the place of one, or of two, if windows' rates depart from the model without that.
 

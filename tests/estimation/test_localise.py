@@ -11,8 +11,8 @@ from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.detection_limit import noticed_from
 from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.localise import problem_of, sampled
-from swarmsim.estimation.sources import find_sources
-from swarmsim.estimation.state import no_sources
+from swarmsim.estimation.sources import find_sources, needed
+from swarmsim.estimation.state import no_sources, settled, signals
 from tests.estimation.conftest import AERIAL, BOTH, DETECTORS, NOWHERE, SPANS
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, counted, drawn, mean_rois, place, presumed
 
@@ -253,6 +253,28 @@ def test_useless_data_give_a_finite_answer_that_is_no_detection(localiser, case)
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(replace(fits, beside_bq=fits.joined_m)))
     assert not np.any(fits.present)
     assert np.all(np.abs(np.asarray(fits.position_m)[:, :2]) <= 90.0)
+
+
+def test_a_source_that_the_others_explain_as_well_is_taken_away(localiser):
+    """One of a thousandth that the search left 9 m beside the true one; of two true ones none."""
+    beside, away = SOURCE + jnp.array([7.0, -6.0, 0.0]), SOURCE + jnp.array([-30.0, 5.0, 0.0])
+
+    @jax.jit
+    def asked(m, places, activity_bq):
+        problem = problem_of(localiser.presumed, m, SPANS)
+        state = no_sources(problem, 2, len(NUCLIDES))
+        sources = replace(state.sources, place=places, activity_bq=activity_bq, present=jnp.ones(2, bool))
+        state = replace(state, sources=sources, added=signals(problem, sources, state.unknowns.lengths))
+        return needed(problem, localiser.params.search, settled(problem, state))
+
+    for second, activity, stays in ((beside, 1e-3 * ACTIVITY, False), (away, ACTIVITY, True)):
+        truth = [*CO_60, (second, activity, "Co-60")] if stays else CO_60
+        m = drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, truth), 3)
+        state, ratio = asked(m, jnp.stack([SOURCE, second]), jnp.array([ACTIVITY, activity], jnp.float32))
+        assert state.sources.present.tolist() == [True, stays]
+        assert float(ratio[0]) > 100.0
+        assert (float(ratio[1]) > 100.0) == stays
+        np.testing.assert_allclose(state.sources.activity_bq[0], ACTIVITY, rtol=0.1)
 
 
 def test_a_posterior_that_is_no_number_is_the_place_found_with_the_reach_of_the_search(localiser):
