@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-_CHUNK = 2_000_000  # candidate points per chunk; bounds the memory
+_CHUNK = 200_000  # candidate points per chunk; they stay in a cache of a core
 _TOLERANCE = 1e-6  # cells, and share of a triangle
 ON_THE_EDGE = 1e-5  # of the distance to the middle of an area: a place so near to an edge is in it
 
@@ -69,14 +69,19 @@ class Hits:
 
 def faces_on(grid: Grid, corners: Floats) -> Hits:
     """Intersections of the vertical lines through the grid's points with triangles [t, 3, 3], edges included."""
-    found = list(_faces(grid, corners))
-    if not found:
-        nothing = np.empty(0, np.int64)
-        return Hits(nothing, np.empty(0), nothing)
-    return Hits(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+    found = list(faces_in_parts(grid, corners))
+    if len(found) == 1:
+        return found[0]
+    nothing = np.empty(0, np.int64)
+    return Hits(
+        np.concatenate([nothing, *(part.cell for part in found)]),
+        np.concatenate([np.empty(0), *(part.height for part in found)]),
+        np.concatenate([nothing, *(part.triangle for part in found)]),
+    )
 
 
-def _faces(grid: Grid, corners: Floats) -> Iterator[tuple[Integers, Floats, Integers]]:
+def faces_in_parts(grid: Grid, corners: Floats) -> Iterator[Hits]:
+    """The hits of `faces_on`, some millions at a time."""
     points = grid.place(corners[..., :2])
     first, second = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
     doubled_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
@@ -103,7 +108,7 @@ def _faces(grid: Grid, corners: Floats) -> Iterator[tuple[Integers, Floats, Inte
             line = np.repeat(np.arange(len(several)), count)[hit]
             height = corners[at, 0, 2][line] + u[hit] * rise[line, 0] + v[hit] * rise[line, 1]
             cell = (row[several] * grid.nx + left[several])[line] + step[hit]
-            yield cell, height, at[line]
+            yield Hits(cell, height, at[line])
 
 
 def _between(low: Floats, high: Floats, grid: Grid) -> tuple[Integers, Integers]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from swarmsim.site.raster import Floats, Grid, Integers, faces_on
+from swarmsim.site.raster import Floats, Grid, Integers, faces_in_parts
 
 STEEP = 0.5  # cosine of 60 degrees: faces that are steeper are faces of steps
 RISE_MIN_M = 0.04  # lower steps are roughness
@@ -92,10 +92,10 @@ def _standing(fine: Grid, grid: Grid, ground: Floats, corners: Floats, step_max:
     most = np.repeat(np.repeat(ndimage.maximum_filter(ground, 3), factor, 0), factor, 1) + step_max
     up = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = corners[up[:, 2] >= STEEP * np.linalg.norm(up, axis=1)]
-    hits = faces_on(fine, flat)
-    usable = hits.height <= most.ravel()[hits.cell]
     level = np.full(coarse.size, -np.inf)
-    np.maximum.at(level, hits.cell[usable], hits.height[usable])
+    for hits in faces_in_parts(fine, flat):
+        usable = hits.height <= most.ravel()[hits.cell]
+        np.maximum.at(level, hits.cell[usable], hits.height[usable])
     return np.where(np.isfinite(level), level, coarse.ravel()).reshape(coarse.shape)
 
 
