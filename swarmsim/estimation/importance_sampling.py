@@ -149,9 +149,7 @@ def sample_posterior(
         if len(modes) == 0:
             return centres, covariances
         beside = about_modes(done)[:, None]
-        before = (
-            jnp.minimum(done.count, MODE_ROUNDS) * (2 * quarter) + jnp.maximum(done.count - MODE_ROUNDS, 0) * quarter
-        )
+        before = quarter * (done.count + jnp.minimum(done.count, MODE_ROUNDS))
         number = (before + jnp.cumsum(beside[:, 0]) - 1) % len(modes)
         return jnp.where(beside, modes[number], centres), jnp.where(beside[..., None], shapes[number], covariances)
 

@@ -81,7 +81,7 @@ def faces_on(grid: Grid, corners: Floats) -> Hits:
 
 
 def faces_in_parts(grid: Grid, corners: Floats) -> Iterator[Hits]:
-    """The hits of `faces_on`, some millions at a time."""
+    """The hits of `faces_on`, up to some hundred thousand at a time."""
     points = grid.place(corners[..., :2])
     first, second = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
     doubled_area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
@@ -94,18 +94,16 @@ def faces_in_parts(grid: Grid, corners: Floats) -> Iterator[Hits]:
         left, right = (x[:, 0] for x in _between(start[:, None], end[:, None], grid))
         for several in _chunks(np.flatnonzero(right >= left), right - left + 1):
             # along a row all of them change evenly
-            at, count = of[several], right[several] - left[several] + 1
+            at = of[several]
             east, north = left[several] - points[at, 0, 0], row[several] - points[at, 0, 1]
             x, y, area = first[at], second[at], doubled_area[at]
             rise = corners[at, 1:, 2] - corners[at, :1, 2]
             u, along_u = (east * y[:, 1] - north * y[:, 0]) / area, y[:, 1] / area
             v, along_v = (x[:, 0] * north - x[:, 1] * east) / area, -x[:, 1] / area
-            step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-            u, v = (
-                np.repeat(start, count) + np.repeat(each, count) * step for start, each in ((u, along_u), (v, along_v))
-            )
+            line, step = _runs(np.zeros_like(at), right[several] - left[several])
+            u, v = u[line] + along_u[line] * step, v[line] + along_v[line] * step
             hit = np.flatnonzero((u >= -_TOLERANCE) & (v >= -_TOLERANCE) & (u + v <= 1.0 + _TOLERANCE))
-            line = np.repeat(np.arange(len(several)), count)[hit]
+            line = line[hit]
             height = corners[at, 0, 2][line] + u[hit] * rise[line, 0] + v[hit] * rise[line, 1]
             cell = (row[several] * grid.nx + left[several])[line] + step[hit]
             yield Hits(cell, height, at[line])
