@@ -24,6 +24,19 @@ EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywh
 
 
 @pytree
+class Rest:
+    """What windows that are left out tell, to second order about one fit (`swarmsim.estimation.focus`).
+
+    Of the P unknowns that windows share, in the order of `swarmsim.estimation.normal_equations.prior_precision`, with
+    logarithms of activities and factors, and the place.
+    """
+
+    information: jax.Array  # [P + 3, P + 3] the windows' own unknowns eliminated
+    push: jax.Array  # [P + 3] derivative of the log likelihood there
+    unknowns: jax.Array  # [P + 3] of that fit, the place in the world
+
+
+@pytree
 class Problem:
     """Everything that the estimate of sources is conditioned on."""
 
@@ -46,6 +59,7 @@ class Problem:
     detector: jax.Array  # [n, D] one-hot: the detector model of each row
     dead_s: jax.Array  # [n, 2] its dead times, the paralyzable and the non-paralyzable one
     nodes: Nodes  # of all windows
+    rest: Rest | None = None  # of windows that are left out
     spans: tuple[Span, ...] = static()
     uncertain: tuple[int, ...] = static()  # numbers of the U materials whose thickness is not known exactly
 

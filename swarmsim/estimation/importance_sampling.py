@@ -66,10 +66,14 @@ NEIGHBOUR_M = 2.4  # those within this distance,
 OVERLAP = 0.8  # times this,
 WIDEST_MODE_M = 0.8  # at most by this
 BLUNT_M = 0.1  # and at least by this about every other one
-SCALES = (2.5, 1.2, 1.2, 1.0)  # of others, over those of the places so far or, about a likely one, of the ridge there
+# Of a later round, in turn: standard deviations over those of the places so far or, about a likely one, of the ridge
+# there; whether about a likely place, or about the mean, to see the tails; whether the error of all places is drawn as
+# was likely so far. Those of a mode have its own.
+SCALES = (2.5, 1.0, 1.2, 1.0, 1.2, 1.0, 1.2, 1.0)
+LIKELY = (False, False, False, True, False, False, False, True)
+ADAPTED = (False, True, True, True, True, True, False, True)
 CLOSER = (1.0, 0.3, 0.1)  # the same in turn of those about the likeliest place, while a few outweigh all others
 FEW = 2.0  # so many
-ABOUT_MEAN = 3  # so many of the scales are about the mean, to see the tails. The others are about likely places.
 TURNED = 1  # number of the round whose places about likely ones lie around a ring; of a ring so do those of every other
 RING = 0.4  # of its radius: standard deviation from which on places are taken to lie on one
 PLACED_EFFECTIVE = 8.0  # weights are flattened until they count as this many when the next round is placed
@@ -127,7 +131,8 @@ def sample_posterior(
     normal, normal_off = even_normals(rounds, per_round), even_normals(rounds, per_round, _EVEN_OFF)
     first_scale, later_scale = (jnp.array(x)[index % len(x)] for x in (FIRST_SCALES, SCALES))
     shapes = _shapes(modes)
-    local, errs = index % len(SCALES) >= ABOUT_MEAN, jnp.asarray(off_std_m) > 0.0
+    local, adapted = (jnp.array(x)[index % len(x)] for x in (LIKELY, ADAPTED))
+    errs = jnp.asarray(off_std_m) > 0.0
 
     def about_modes(done: Rounds) -> jax.Array:
         """Which places [P] of the next round lie about modes."""
@@ -143,7 +148,7 @@ def sample_posterior(
         spread = jnp.where(first, covariance, jnp.where(local[:, None, None], ridges, about))
         # a tip that is much narrower than all that is known is closed in on
         few = ~first & (worth(normalised(log_weights_of(done))) < FEW)
-        closer = jnp.where(few & local, jnp.array(CLOSER)[(index // len(SCALES)) % len(CLOSER)], 1.0)
+        closer = jnp.where(few & local, jnp.array(CLOSER)[(jnp.cumsum(local) - 1) % len(CLOSER)], 1.0)
         centres = jnp.where((closer < 1.0)[:, None], likeliest_of(done), centres)
         covariances = jnp.square(jnp.where(first, first_scale, later_scale * closer))[:, None, None] * spread
         if len(modes) == 0:
@@ -160,7 +165,7 @@ def sample_posterior(
         inverse = jax.scipy.linalg.solve_triangular(roots, eye, lower=True)
         modes_, later = about_modes(done), any_weight(done)
         exact = (modes_ | (first_scale < 1.0)) & (done.count == 0)
-        mean, std, slope = _of_off(done, centres, errs & exact, errs & later & (index % 2 == 1))
+        mean, std, slope = _of_off(done, centres, errs & exact, errs & later & adapted)
         drawn_from = Normals(centres=centres, inverse=inverse, off=mean, off_std=std, slope=slope)
         aside = jnp.einsum("pij,pj->pi", roots, normal[done.count])
         places, off = centres + aside, mean + jnp.einsum("pij,pj->pi", slope, aside) + std * normal_off[done.count]
@@ -307,7 +312,8 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, dr
 
     There are ``drawn`` [] places in both.
     """
-    odd = jnp.arange(values.shape[1]) // len(SCALES) % 2 == 1  # both halves have all scales
+    # both halves have all scales
+    odd = (jnp.arange(values.shape[1]) // len(SCALES) + jnp.arange(values.shape[0])[:, None]) % 2 == 1
     means = [
         moments(values, truncated(jnp.where(half, log_weights, -jnp.inf), 0.5 * drawn))[0]
         for half in (odd, jnp.logical_not(odd))

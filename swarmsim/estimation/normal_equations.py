@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.device import on_processor
-from swarmsim.estimation.forward import Problem, Rates, dead_time, variance_of
+from swarmsim.estimation.forward import Problem, Rates, Rest, dead_time, variance_of
 from swarmsim.estimation.likelihood import poisson_log_likelihood, scaled_inverse
 from swarmsim.pytree import pytree
 
@@ -73,6 +73,7 @@ class Linearised:
     mean: jax.Array  # [R, n]
     columns: jax.Array  # [B, R, n]
     nearer: jax.Array  # [3, n] change of ln(rate of the source) with its place
+    where: jax.Array  # [3] that place, in the world
     variance: jax.Array  # [2, n] of the priors of a window's own unknowns, background and gain
     registered: jax.Array  # [n] derivative of the registered counts of a window by the true ones
 
@@ -96,6 +97,7 @@ def linearised(problem: Problem, source: Rates, others: Others, where: jax.Array
         # what is registered of a change of the true counts
         columns=share * added + true * (fall * jnp.sum(added, axis=1))[:, None],
         nearer=(-2.0 * offset / squared).T,
+        where=where,
         registered=share + fall * total,
         variance=_variance(problem, jnp.sum(own, axis=0), jnp.sum(rest, axis=1), others, where, source.edge),
     )
@@ -207,9 +209,10 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
     """The normal equations at ``u``, where ``model`` is linearised."""
     m, k = problem.measurements, u.others.shape[0]
     e = _eliminated(problem, model, u)
-    column, factor = _unknowns(problem, model, k)
-    whole = jnp.sum(e.products[column][:, column] * factor[:, None] * factor, axis=-1)
-    push = jnp.sum(e.pushes[column] * factor, axis=-1)
+    whole, push = _sums(problem, model, k, e)
+    if problem.rest is not None:
+        more, towards = _of_rest(problem.rest, model, u)
+        whole, push = whole + more, push + towards
     common_precision = prior_precision(problem, k)
     p = common_precision.shape[0]
     information = whole[:p, :p] + jnp.diag(common_precision)
@@ -229,6 +232,41 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
         precision=e.precision,
         fitted=jnp.sum(jnp.where(m.valid, 2.0 - told, 0.0)),
     )
+
+
+def _sums(problem: Problem, model: Linearised, sources: int, e: _Eliminated) -> tuple[jax.Array, jax.Array]:
+    """Normal equations [P + 3, P + 3], [P + 3] of the unknowns that windows share and the place, without priors."""
+    column, factor = _unknowns(problem, model, sources)
+    whole = jnp.sum(e.products[column][:, column] * factor[:, None] * factor, axis=-1)
+    return whole, jnp.sum(e.pushes[column] * factor, axis=-1)
+
+
+def sums_of(problem: Problem, model: Linearised, u: Unknowns) -> tuple[jax.Array, jax.Array]:
+    """`Rest.information` and `Rest.push` of all windows."""
+    return _sums(problem, model, u.others.shape[0], _eliminated(problem, model, u))
+
+
+def told_by_each(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
+    """Information [n] that each window has about ln(rate of the source), its own unknowns eliminated."""
+    return _eliminated(problem, model, u).products[0, 0]
+
+
+def unknowns_of(model: Linearised, u: Unknowns) -> jax.Array:
+    """The unknowns [P + 3] that windows share and the place in the world, in the order of `Rest`."""
+    of_sources = jnp.log(jnp.maximum(jnp.append(u.activity_bq, u.others), 1e-3))
+    return jnp.concatenate([of_sources, u.level, u.lengths, model.where])
+
+
+def _of_rest(rest: Rest, model: Linearised, u: Unknowns) -> tuple[jax.Array, jax.Array]:
+    """The normal equations of the windows that are left out, at ``u``."""
+    off = unknowns_of(model, u) - rest.unknowns
+    return rest.information, rest.push - rest.information @ off
+
+
+def _log_likelihood_of(rest: Rest, model: Linearised, u: Unknowns) -> jax.Array:
+    """Log likelihood [] of the windows that are left out, up to a constant."""
+    off = unknowns_of(model, u) - rest.unknowns
+    return off @ rest.push - 0.5 * off @ rest.information @ off
 
 
 @jax.jit
@@ -312,8 +350,9 @@ def window_unknowns(u: Unknowns) -> jax.Array:
 
 
 def log_prior(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
-    """Log prior [] of the unknowns but the place, up to a constant."""
+    """Log prior [] of the unknowns but the place, up to a constant; with what windows that are left out tell."""
     shared = prior_precision(problem, u.others.shape[0]) * jnp.square(_common(u))
     relative = jnp.square(window_unknowns(u)) / model.variance
     own = relative[0] + (problem.tail + 1.0) * jnp.log1p(relative[1] / problem.tail)
-    return -0.5 * (jnp.sum(shared) + jnp.sum(jnp.where(problem.measurements.valid, own, 0.0)))
+    prior = -0.5 * (jnp.sum(shared) + jnp.sum(jnp.where(problem.measurements.valid, own, 0.0)))
+    return prior if problem.rest is None else prior + _log_likelihood_of(problem.rest, model, u)

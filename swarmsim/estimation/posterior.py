@@ -6,8 +6,8 @@ The likelihood is raised to a power below one, the learning rate (Holmes and Wal
 of the model are alike in neighbouring windows, and a posterior that takes each for one of its own is too narrow.
 
 The posterior of a source holds the places of the others. Where sampling finds a place of one that explains the counts
-better than the search had, the source is moved and all are sampled again (Besag, "On the statistical analysis of dirty
-pictures", JRSS B 48, 1986, 259: iterated conditional modes).
+better than the search had, the source is moved, and all are sampled again if it was far or others are near (iterated
+conditional modes: Besag, "On the statistical analysis of dirty pictures", JRSS B 48, 1986, 259).
 """
 
 from dataclasses import replace
@@ -19,6 +19,7 @@ import jax.numpy as jnp
 
 from swarmsim.device import IN_STEP, for_those, repeat_while, some_at_a_time
 from swarmsim.estimation.fit import alone, log_prior_of_activity, settle
+from swarmsim.estimation.focus import focused
 from swarmsim.estimation.forward import Problem, ways_from
 from swarmsim.estimation.importance_sampling import Posterior, sample_posterior
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
@@ -35,6 +36,7 @@ NO_TAIL = 1e5  # degrees of freedom of a distribution that is as good as normal
 WEIGH_STEPS = 2  # Gauss-Newton steps at a place
 SWEEPS = 5  # over all sources, at most
 BETTER = 4.0  # in the logarithm of the likelihood, a place at which a source is taken to be from then on
+FAR_M = 0.5  # from where a source was to such a place: its posterior is sampled again
 TOGETHER_M = 25.0  # sources nearer to one another are not known independently of one another
 
 
@@ -61,7 +63,7 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> S
     """Posteriors of all sources, one after another.
 
     Sampling looks at more places than the search, and at all of what the counts leave open. Where one is found that
-    explains them better the source is there from then on, and all are sampled again beside it.
+    explains them better the source is there from then on, and all may be sampled again beside it (`_moved`).
     """
     zero, count = jnp.zeros(()), state.sources.present.shape[0]
     nowhere = Posterior(
@@ -73,8 +75,8 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> S
 
         def sample() -> tuple[tuple[State, jax.Array], Any]:
             posterior, beside = _posterior(problem, state, k, rounds, per_round)
-            after, better = _moved(problem, state, k, posterior.likeliest)
-            return (after, moved | better), (posterior, beside)
+            after, far = _moved(problem, state, k, posterior.likeliest)
+            return (after, moved | far), (posterior, beside)
 
         return for_those(state.sources.present[k], sample, lambda: (known, (nowhere, zero)), IN_STEP)
 
@@ -89,10 +91,20 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> S
 
 
 def _moved(problem: Problem, state: State, k: jax.Array, place: jax.Array) -> tuple[State, jax.Array]:
-    """The state with source ``k`` at ``place`` [3], if that explains the counts better; and whether [] it does."""
-    tried = attempt(problem, state.sources.nuclide[k], without(state, k).added, state.unknowns, place)
+    """The state with source ``k`` at ``place`` [3], if that explains the counts better; and whether [] to sample again.
+
+    The places that were drawn lie about the better one as well unless it is far from the one before, and others hardly
+    notice the change unless they are near.
+    """
+    s = state.sources
+    tried = attempt(problem, s.nuclide[k], without(state, k).added, state.unknowns, place)
     better = tried.fit.likelihood > state.likelihood + BETTER
-    return jax.tree.map(partial(jnp.where, better), with_source(problem, state, k, tried), state), better
+    apart = jnp.linalg.norm(s.place - s.place[k], axis=-1)
+    beside = jnp.any(s.present & (apart < TOGETHER_M) & (jnp.arange(len(apart)) != k))
+    far = jnp.linalg.norm(place - s.place[k]) > FAR_M
+    return jax.tree.map(partial(jnp.where, better), with_source(problem, state, k, tried), state), better & (
+        far | beside
+    )
 
 
 def of_others(problem: Problem, state: State) -> jax.Array:
@@ -132,6 +144,7 @@ def of_others(problem: Problem, state: State) -> jax.Array:
 def _posterior(
     problem: Problem, state: State, k: jax.Array, rounds: int, per_round: int
 ) -> tuple[Posterior, jax.Array]:  # fmt: skip
+    problem, state = focused(problem, state, k)
     limits, s = bounds(problem), state.sources
     others = without(state, k).added
     u, nuclide = replace(state.unknowns, activity_bq=s.activity_bq[k]), s.nuclide[k]
