@@ -1,9 +1,9 @@
-"""An estimate's problem as one source sees it: the windows that tell most of it, and what all others tell in sum.
+"""An estimate's problem as one source sees it: the windows that tell its place in detail, and all others in sum.
 
-A posterior is sampled at hundreds of places within metres of its source. Half of a survey's windows are so far off that
-hardly anything changes there, and the more vehicles there are the more of them: together they hold some hundredths of
-what is known of the source, but also the levels of the background and the other sources. They are kept to second order
-about the fit, once for all places.
+A posterior is sampled at hundreds of places within metres of its source. What most windows of a survey tell changes
+evenly from one of them to the next, and the more vehicles there are the more such windows: they are kept to second
+order about the fit, once for all places. The others, near the source or where walls throw shadows on them, stay as they
+are.
 """
 
 from dataclasses import replace
@@ -12,13 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.estimation.forward import Problem, Rest, rates, ways_from
+from swarmsim.estimation.forward import Problem, Rates, Rest, Ways, rates, ways_from
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.estimation.nodes import Span
 from swarmsim.estimation.normal_equations import (
-    Linearised,
     Others,
-    Unknowns,
     linearised,
     sums_of,
     told_by_each,
@@ -27,6 +25,10 @@ from swarmsim.estimation.normal_equations import (
 from swarmsim.estimation.state import State, without
 
 KEPT = 96  # windows of each span
+ALONG = 1.5  # standard deviations along each axis of what is known of the place, at which windows are looked at
+AROUND_M = 1.0  # and so far off, in modes that there may be beside it
+LEAST_M = 0.02  # at least
+DARK = 1e-3  # of the brightest rate per becquerel: darker windows count as if they were as bright
 
 
 def focused(problem: Problem, state: State, k: jax.Array) -> tuple[Problem, State]:
@@ -35,10 +37,9 @@ def focused(problem: Problem, state: State, k: jax.Array) -> tuple[Problem, Stat
         return problem, state
     s = state.sources
     u = replace(state.unknowns, activity_bq=s.activity_bq[k])
-    ways = ways_from(problem, s.place[k])
-    source = rates(problem, ways, s.nuclide[k], u.lengths)
+    source, ways, bent = _looked_at(problem, state, k, u.lengths)
     model = linearised(problem, source, without(state, k).added, ways.position_m, u)
-    rows = _most_telling(problem, model, u)
+    rows = _most(problem, told_by_each(problem, model, u) * bent)
     m = problem.measurements
     left = replace(problem, measurements=replace(m, valid=m.valid.at[rows].set(False)))
     information, push = sums_of(left, model, u)
@@ -46,16 +47,37 @@ def focused(problem: Problem, state: State, k: jax.Array) -> tuple[Problem, Stat
     return replace(_of_rows(problem, rows), rest=rest), _state_of(state, rows)
 
 
-def _most_telling(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
-    """The rows [m] of the windows to keep, in ascending order: by their leverage on the place and the activity."""
-    told = told_by_each(problem, model, u)
-    by = jnp.concatenate([model.nearer, jnp.ones((1, told.shape[0]))])
-    information = (by * told) @ by.T
-    covariance = scaled_inverse(information.at[2, 2].add(height_precision(problem.height_std_m)))
-    leverage = told * jnp.sum(by * (covariance @ by), axis=0)
-    leverage = jnp.where(problem.measurements.valid, leverage, -1.0)
+def _looked_at(problem: Problem, state: State, k: jax.Array, lengths: jax.Array) -> tuple[Rates, Ways, jax.Array]:
+    """The rates of source ``k``, the ways from it, and how far its rates [n] are from even about it.
+
+    The latter are mean squares of what the logarithms of rates at places around depart from a straight line by.
+    """
+    place, nuclide = state.sources.place[k], state.sources.nuclide[k]
+    known = jnp.diag(jnp.append(jnp.full(2, 1.0 / AROUND_M**2), height_precision(problem.height_std_m)))
+    covariance = scaled_inverse(problem.learning_rate * state.sources.towards[k] + known)
+    axes = ALONG * jnp.linalg.cholesky(covariance + (jnp.square(problem.geometry_std_m) + LEAST_M**2) * jnp.eye(3)).T
+    wide = AROUND_M * jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    offsets = jnp.concatenate([axes, -axes, wide, jnp.zeros((1, 3))])  # the source itself is the last one
+
+    def look(_: tuple[Rates, Ways], offset: jax.Array) -> tuple[tuple[Rates, Ways], tuple[jax.Array, jax.Array]]:
+        ways = ways_from(problem, place + offset)
+        found = rates(problem, ways, nuclide, lengths)
+        return (found, ways), (jnp.sum(found.counts, axis=1), ways.position_m)
+
+    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: look(None, offsets[0])[0]))
+    (source, ways), (bright, at) = jax.lax.scan(look, first, offsets)
+    log_rate = jnp.log(bright + DARK * jnp.max(bright[-1]) + 1e-30)
+    apart = ways.position_m - problem.measurements.position_m
+    nearer = -2.0 * apart / jnp.maximum(jnp.sum(apart * apart, axis=-1, keepdims=True), 0.01)
+    bent = log_rate[:-1] - log_rate[-1] - (at[:-1] - at[-1]) @ nearer.T
+    return source, ways, jnp.mean(jnp.square(bent), axis=0)
+
+
+def _most(problem: Problem, values: jax.Array) -> jax.Array:
+    """The rows [m] with the largest ``values`` [n] in each span, in ascending order."""
+    values = jnp.where(problem.measurements.valid, values, -1.0)
     rows = [
-        first + jnp.sort(jax.lax.top_k(leverage[first:last], min(KEPT, last - first))[1])
+        first + jnp.sort(jax.lax.top_k(values[first:last], min(KEPT, last - first))[1])
         for first, last, _, _ in problem.spans
     ]
     return jnp.concatenate(rows)

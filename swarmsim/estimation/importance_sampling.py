@@ -312,8 +312,9 @@ def _halves(values: jax.Array, log_weights: jax.Array, covariance: jax.Array, dr
 
     There are ``drawn`` [] places in both.
     """
-    # both halves have all scales
-    odd = (jnp.arange(values.shape[1]) // len(SCALES) + jnp.arange(values.shape[0])[:, None]) % 2 == 1
+    # both have all kinds, and neighbours in the order of draws, which fill space evenly, are in different ones
+    number = jnp.arange(values.shape[1])
+    odd = (number + number // len(SCALES) + jnp.arange(values.shape[0])[:, None]) % 2 == 1
     means = [
         moments(values, truncated(jnp.where(half, log_weights, -jnp.inf), 0.5 * drawn))[0]
         for half in (odd, jnp.logical_not(odd))

@@ -195,7 +195,7 @@ def _of_two_places(turn):
         far = jnp.abs(x @ across) > 25.0
         return weighed(x, jnp.where(far, 0.0, -jnp.inf))
 
-    return sample_posterior(weigh, jnp.zeros(3), jnp.diag(jnp.array([100.0, 100.0, 0.01])), 4, 8)
+    return sample_posterior(weigh, jnp.zeros(3), jnp.diag(jnp.array([100.0, 100.0, 0.01])), 8, 8)
 
 
 def test_a_needle_at_the_start_is_not_missed():
