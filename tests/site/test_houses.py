@@ -112,7 +112,7 @@ def test_what_boxes_do_not_follow_is_told(tmp_path):
     cone = trimesh.creation.cone(radius=3.0, height=8.0)
     told = " ".join(made(tmp_path, cone).report["warnings"])
     said = re.search(r"boxes do not follow the shape of: house \((\d+) m3 for ([\d.]+) m3\)", told)
-    assert float(said[1]) == pytest.approx(288.0, rel=0.01)
+    assert float(said[1]) == pytest.approx(288.0, rel=0.02)  # a polygon for a circle
     assert float(said[2]) == pytest.approx(cone.volume, rel=0.01)
     plain = made(tmp_path, block((8.0, 6.0, 5.0), (0.0, 0.0, 2.5))).report["warnings"]
     assert not any("do not follow" in warning for warning in plain)
