@@ -17,7 +17,15 @@ from swarmsim.site.mesh_parts import NO_COLOUR, Part
 from swarmsim.site.meshes import Mesh, read_mesh
 from swarmsim.site.model import VisualMesh
 from swarmsim.site.obstacles import Box
-from swarmsim.site.part_rules import BOXES_MAX, check_patterns, described, find_obstacles, matches, unnamed_told
+from swarmsim.site.part_rules import (
+    BOXES_MAX,
+    check_patterns,
+    described,
+    find_obstacles,
+    matches,
+    unlike_told,
+    unnamed_told,
+)
 from swarmsim.site.raster import Floats, Grid, faces_on, top_of_cells
 from swarmsim.site.size_checks import check_cells, check_extent
 from swarmsim.site.source_files import TIFF_SUFFIXES, check_file
@@ -99,7 +107,7 @@ def _from_mesh(path: Path, spec: SiteSpec) -> RawSite:
         "parts": told,
         "boxes_left_out": len(boxes) - len(kept),
         "shift_m": list(mesh.shift_m),
-        "warnings": [*mesh.warnings, *found.warnings, *unnamed_told(told, spec)],
+        "warnings": [*mesh.warnings, *found.warnings, *unnamed_told(told, spec), *unlike_told(things.unlike)],
     }
     return _finish(
         grid, ground, found.surface, clear, steps, [boxes[i] for i in kept], [things.materials[i] for i in kept],

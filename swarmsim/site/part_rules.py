@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from swarmsim.config.errors import Problem, raise_if_any
 from swarmsim.config.names import did_you_mean, one_of
 from swarmsim.config.site import ObstacleMaterial, SiteSpec
-from swarmsim.site.mesh_parts import Part
+from swarmsim.site.columns import closed_volume
+from swarmsim.site.drawn_walls import drawn_walls
+from swarmsim.site.mesh_parts import Floats, Part
 from swarmsim.site.obstacles import Box, boxes_of, components
 
 Mask = NDArray[np.bool_]
@@ -19,6 +21,10 @@ Mask = NDArray[np.bool_]
 AIR = "air"  # material of parts painted on others, such as windows, which get no box
 BOXES_MAX = 1024  # the largest are kept: every ray is intersected with every box
 NAMES_SHOWN = 40
+UNLIKE = 2.5  # factor of matter: a box around an ellipsoid has 1.9 times its matter, one around a gable roof 2.0 times
+SMALL_M3 = 1.0
+UNLIKE_SHOWN = 5
+UNNAMED = "without a name"
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,7 @@ class Obstacles:
     materials: list[str]  # of each box
     passable: list[bool]  # whether a rover can pass each box
     stops: Mask  # [t] triangles that stop a rover
+    unlike: dict[str, tuple[float, float]]  # matter imported and drawn, m3, of parts by name where they differ much
 
 
 def matches(part: Part, pattern: str) -> bool:
@@ -68,6 +75,7 @@ def find_obstacles(parts: list[Part], bare: Mask, spec: SiteSpec) -> Obstacles:
     boxes: list[Box] = []
     names: list[str] = []
     passable: list[bool] = []
+    unlike: dict[str, tuple[float, float]] = {}
     stops = ~bare
     start = 0
     for part in parts:
@@ -77,11 +85,47 @@ def find_obstacles(parts: list[Part], bare: Mask, spec: SiteSpec) -> Obstacles:
         stops[span] &= not rule.traversable
         own = part.triangles[~bare[span]] if rule.material != AIR else part.triangles[:0]
         for piece in components(part.vertices, own) if len(own) else ():
-            found = boxes_of(part.vertices[own[piece]], rule.wall_m)
+            corners = part.vertices[own[piece]]
+            walls = drawn_walls(corners)
+            found = walls or boxes_of(corners, rule.wall_m)
+            if not walls and (both := _unlike(corners, found)):
+                name = part.names[0] if part.names else UNNAMED
+                before = unlike.get(name, (0.0, 0.0))
+                unlike[name] = (before[0] + both[0], before[1] + both[1])
             boxes += found
             names += [rule.material] * len(found)
             passable += [rule.traversable] * len(found)
-    return Obstacles(boxes, names, passable, stops)
+    return Obstacles(boxes, names, passable, stops, unlike)
+
+
+def _unlike(corners: Floats, boxes: list[Box]) -> tuple[float, float] | None:
+    """Matter of the ``boxes`` and of the closed component that they stand for, m3, where it differs by `UNLIKE`.
+
+    Hollow boxes are as a rule says, and pieces of less than `SMALL_M3` are not looked at.
+    """
+    imported = sum(box.volume for box in boxes)
+    if imported < SMALL_M3 or any(box.wall for box in boxes):
+        return None
+    drawn = closed_volume(corners)
+    if drawn is None or imported / UNLIKE <= drawn <= imported * UNLIKE:
+        return None
+    return imported, drawn
+
+
+def unlike_told(unlike: dict[str, tuple[float, float]]) -> list[str]:
+    """A warning of the parts that boxes do not follow, those with most matter first."""
+    if not unlike:
+        return []
+    worst = sorted(unlike.items(), key=lambda part: -abs(part[1][0] - part[1][1]))
+    shown = ", ".join(
+        f"{name} ({imported:.3g} m3 for {drawn:.3g} m3)" for name, (imported, drawn) in worst[:UNLIKE_SHOWN]
+    )
+    more = f" and {len(worst) - UNLIKE_SHOWN} more" if len(worst) > UNLIKE_SHOWN else ""
+    return [
+        f"boxes do not follow the shape of: {shown}{more}; radiation meets the matter of the boxes, and their insides "
+        "are closed to rovers. Draw them as pieces that are boxes, such as one object for each wall, or say wall_m of "
+        "what is hollow (obstacles)"
+    ]
 
 
 def described(parts: list[Part], bare: Mask, spec: SiteSpec) -> list[dict[str, Any]]:
@@ -103,9 +147,7 @@ def described(parts: list[Part], bare: Mask, spec: SiteSpec) -> list[dict[str, A
 
 def unnamed_told(parts: list[dict[str, Any]], spec: SiteSpec) -> list[str]:
     """A warning of the obstacles that no rule names; ``parts`` as of `described`."""
-    names = list(
-        dict.fromkeys(part["names"][0] if part["names"] else "without a name" for part in parts if not part["rule"])
-    )
+    names = list(dict.fromkeys(part["names"][0] if part["names"] else UNNAMED for part in parts if not part["rule"]))
     if not names:
         return []
     shown = ", ".join(names[:NAMES_SHOWN]) + (
