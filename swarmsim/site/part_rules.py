@@ -1,6 +1,6 @@
 """What the parts of a mesh are: ground, or obstacles of the material that the specification's rules say."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ Mask = NDArray[np.bool_]
 AIR = "air"  # material of parts painted on others, such as windows, which get no box
 BOXES_MAX = 1024  # the largest are kept: every ray is intersected with every box
 NAMES_SHOWN = 40
+AS_DRAWN = 3.0  # a wall that is drawn up to so many times as thick as its rule says is as thick as drawn
 UNLIKE = 2.5  # factor of matter: a box around an ellipsoid has 1.9 times its matter, one around a gable roof 2.0 times
 SMALL_M3 = 1.0
 UNLIKE_SHOWN = 5
@@ -83,10 +84,11 @@ def find_obstacles(parts: list[Part], bare: Mask, spec: SiteSpec) -> Obstacles:
         start = span.stop
         rule = _rule(part, spec)
         stops[span] &= not rule.traversable
+        said = None if rule_of(part, spec) is None else rule.wall_m
         own = part.triangles[~bare[span]] if rule.material != AIR else part.triangles[:0]
         for piece in components(part.vertices, own) if len(own) else ():
             corners = part.vertices[own[piece]]
-            walls = drawn_walls(corners)
+            walls = [_as_said(box, said) for box in drawn_walls(corners) or ()]
             found = walls or boxes_of(corners, rule.wall_m)
             if not walls and (both := _unlike(corners, found)):
                 name = part.names[0] if part.names else UNNAMED
@@ -96,6 +98,16 @@ def find_obstacles(parts: list[Part], bare: Mask, spec: SiteSpec) -> Obstacles:
             names += [rule.material] * len(found)
             passable += [rule.traversable] * len(found)
     return Obstacles(boxes, names, passable, stops, unlike)
+
+
+def _as_said(box: Box, wall_m: float | None) -> Box:
+    """A drawn wall with the matter that its rule says: sheets and planks are often drawn as thick as their frame.
+
+    Half of it on either side. Where the rule is about as thick as the drawing, this is the truth.
+    """
+    if wall_m is None or 2.0 * min(box.half) <= AS_DRAWN * wall_m:
+        return box
+    return replace(box, wall=0.5 * wall_m)
 
 
 def _unlike(corners: Floats, boxes: list[Box]) -> tuple[float, float] | None:

@@ -116,3 +116,14 @@ def test_what_boxes_do_not_follow_is_told(tmp_path):
     assert float(said[2]) == pytest.approx(cone.volume, rel=0.01)
     plain = made(tmp_path, block((8.0, 6.0, 5.0), (0.0, 0.0, 2.5))).report["warnings"]
     assert not any("do not follow" in warning for warning in plain)
+
+
+@pytest.mark.parametrize(("said", "found"), [(None, 0.2), (0.1, 0.2), (0.05, 0.05), (0.001, 0.001)])
+def test_sheets_are_as_thick_as_their_rule_says(tmp_path, said, found):
+    """Walls of 0.2 m: a rule that says about as much leaves these as drawn; planks and sheets are thinner."""
+    inner = [[0, 4], [0.2, 4], [0.2, 5.8], [7.8, 5.8], [7.8, 0.2], [0.2, 0.2], [0.2, 2], [0, 2]]
+    outline = [[0, 0], [8, 0], [8, 6], [0, 6], *inner]
+    rule = {"match": "house", "material": "steel"} | ({} if said is None else {"wall_m": said})
+    raw = made(tmp_path, prism(outline, 3.0), obstacles=(rule,))
+    south = {box.wall for box in raw.boxes if abs(box.centre[1] - 0.1) < 0.01}
+    assert [2.0 * wall if wall else 0.2 for wall in south] == pytest.approx([found])
