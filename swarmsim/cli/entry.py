@@ -12,11 +12,12 @@ import threading
 from collections.abc import Sequence
 from typing import Any
 
-from cyclopts import CycloptsError
+from cyclopts import CycloptsError, UnusedCliTokensError
 
 from swarmsim.cli.commands import app
 from swarmsim.config.errors import InputError, stop_of
 
+_HELP = "'swarmsim --help' and 'swarmsim COMMAND --help'"
 _AGAIN_S = 0.05  # after which what swallowed Ctrl-C has ended
 EXIT_INPUT, EXIT_HUNG_UP, EXIT_INTERRUPTED, EXIT_TERMINATED = 2, 129, 130, 143
 
@@ -88,8 +89,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             result_action="return_value",
         )
         return code if isinstance(code, int) else 0
+    except UnusedCliTokensError as error:
+        extra = ", ".join(f"'{token}'" for token in error.unused_tokens or ())
+        sys.stderr.write(f"one argument too many, or an unknown one: {extra}\n\nSee {_HELP}.\n")
+        return EXIT_INPUT
     except CycloptsError as error:
-        sys.stderr.write(f"{error}\n\nSee 'swarmsim --help' and 'swarmsim COMMAND --help'.\n")
+        sys.stderr.write(f"{error}\n\nSee {_HELP}.\n")
         return EXIT_INPUT
     except InputError as error:
         _told(f"{describe(error)}\n")

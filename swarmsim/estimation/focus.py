@@ -59,13 +59,13 @@ def _looked_at(problem: Problem, state: State, k: jax.Array, lengths: jax.Array)
     wide = AROUND_M * jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
     offsets = jnp.concatenate([axes, -axes, wide, jnp.zeros((1, 3))])  # the source itself is the last one
 
-    def look(_: tuple[Rates, Ways], offset: jax.Array) -> tuple[tuple[Rates, Ways], tuple[jax.Array, jax.Array]]:
+    def look(offset: jax.Array) -> tuple[tuple[Rates, Ways], tuple[jax.Array, jax.Array]]:
         ways = ways_from(problem, place + offset)
         found = rates(problem, ways, nuclide, lengths)
         return (found, ways), (jnp.sum(found.counts, axis=1), ways.position_m)
 
-    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: look(None, offsets[0])[0]))
-    (source, ways), (bright, at) = jax.lax.scan(look, first, offsets)
+    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: look(offsets[0])[0]))
+    (source, ways), (bright, at) = jax.lax.scan(lambda _, offset: look(offset), first, offsets)
     log_rate = jnp.log(bright + DARK * jnp.max(bright[-1]) + 1e-30)
     apart = ways.position_m - problem.measurements.position_m
     nearer = -2.0 * apart / jnp.maximum(jnp.sum(apart * apart, axis=-1, keepdims=True), 0.01)

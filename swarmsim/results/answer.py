@@ -10,7 +10,7 @@ from swarmsim.missions.plan_build import mapped_areas
 from swarmsim.missions.state import MissionState
 from swarmsim.radiation.identify import NONE, UNKNOWN
 from swarmsim.radiation.rate import rate_showing
-from swarmsim.results.finding import NO_SPECTRUM, NO_WAY, finding
+from swarmsim.results.finding import NO_SPECTRUM, NO_WAY, NOT_ASKED, finding
 from swarmsim.results.record import Estimate, Event, RadiationMap, Samples, Spectrum
 from swarmsim.results.saturation import SATURATED_SHARE
 from swarmsim.results.sources import gamma_constants
@@ -140,10 +140,15 @@ def _spectrum(simulation: Simulation, conclusion: Any) -> Spectrum | None:
 
 
 def _hindrance(simulation: Simulation, end: MissionState, events: list[Event]) -> str | None:
-    """What kept rovers from the source: no drivable way there, or what happened to the first of them that was lost."""
+    """Why no spectrum was taken near a source, as far as known.
+
+    No drivable way there, a mission that names no nuclide, or what happened to the first rover that was lost.
+    """
     if _no_way(simulation, end):
         return NO_WAY
     scenario = simulation.scenario
+    if scenario.mission.identification is None:
+        return NOT_ASKED
     sent = {
         scenario.members[number].name
         for phase, members in zip(simulation.plan.phases, scenario.phase_members, strict=True)

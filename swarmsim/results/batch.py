@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from swarmsim.families.draw import columns
-from swarmsim.results.record import MissionRecord
+from swarmsim.results.record import Estimate, MissionRecord
 from swarmsim.results.summary import (
     Timings,
     dose_summary,
@@ -42,14 +42,10 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
         row |= {f"{phase.name}_{key}": value for key, value in measured(record, phase).items()}
     row["duration_s"] = float(record.end_s)
     hotspot = hotspot_of(record.map)
-    row |= _axes("hotspot", None if hotspot is None else plain(hotspot), ("east_m", "north_m"))
+    row |= _axes("hotspot_", None if hotspot is None else plain(hotspot), ("east_m", "north_m"))
     row["hotspot_error_m"] = None if hotspot is None else nearest_of(hotspot, record.sources)[1]
     for name, estimate in (("survey_estimate", record.survey_estimate), ("source", record.estimate)):
-        values = estimate_summary(estimate, record)
-        row |= _axes(name, values.pop("position_m"), ("east_m", "north_m", "up_m"))
-        row |= _axes(name, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
-        row |= _covariances(name, values.pop("position_covariance_m2"))
-        row |= {f"{name}_{key}": value for key, value in values.items()}
+        row |= _of_estimate(f"{name}_", estimate, record)
     if record.departures is not None:
         row |= {f"true_thickness_factor_{key}": value for key, value in record.departures.thickness_factor.items()}
         row |= {f"true_sensitivity_factor_{key}": value for key, value in record.departures.sensitivity_factor.items()}
@@ -70,14 +66,36 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     return row
 
 
-def _axes(name: str, values: list[float] | None, axes: tuple[str, ...]) -> dict[str, float | None]:
-    return {f"{name}_{axis}": None if values is None else values[k] for k, axis in enumerate(axes)}
+def source_rows(record: MissionRecord) -> list[dict[str, Any]]:
+    """The sources that one mission found as flat rows of ``sources.parquet``, the surest first; none if it found none.
+
+    ``error_m`` and ``true_nuclide`` are against the nearest true source, which may be that of another row too.
+    """
+    record = record.finite()
+    about = {"seed": int(record.seed), "status": record.status}
+    return [
+        about | {"number": number} | _of_estimate("", estimate, record)
+        for number, estimate in enumerate(record.estimates)
+    ]
 
 
-def _covariances(name: str, matrix: list[list[float]] | None) -> dict[str, float | None]:
+def _of_estimate(before: str, estimate: Estimate | None, record: MissionRecord) -> dict[str, Any]:
+    """An estimate as columns whose names begin with ``before``."""
+    values = estimate_summary(estimate, record)
+    row: dict[str, Any] = _axes(before, values.pop("position_m"), ("east_m", "north_m", "up_m"))
+    row |= _axes(before, values.pop("position_std_m"), ("std_east_m", "std_north_m", "std_up_m"))
+    row |= _covariances(before, values.pop("position_covariance_m2"))
+    return row | {f"{before}{key}": value for key, value in values.items()}
+
+
+def _axes(before: str, values: list[float] | None, axes: tuple[str, ...]) -> dict[str, float | None]:
+    return {f"{before}{axis}": None if values is None else values[k] for k, axis in enumerate(axes)}
+
+
+def _covariances(before: str, matrix: list[list[float]] | None) -> dict[str, float | None]:
     """The covariances [m2] of a place between axes; its variances follow from the standard deviations."""
     pairs = {"east_north": (0, 1), "east_up": (0, 2), "north_up": (1, 2)}
-    return {f"{name}_covariance_{axes}_m2": None if matrix is None else matrix[i][j] for axes, (i, j) in pairs.items()}
+    return {f"{before}covariance_{axes}_m2": None if matrix is None else matrix[i][j] for axes, (i, j) in pairs.items()}
 
 
 def all_keys(rows: Sequence[dict[str, Any]]) -> list[str]:

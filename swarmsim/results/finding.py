@@ -16,6 +16,7 @@ NOTHING_SOUGHT = "nothing was sought"
 NOTHING_FOUND = "no source above background"
 NO_WAY = "no drivable way for the rover to reach it"
 NO_SPECTRUM = "no spectrum was taken near it"
+NOT_ASKED = "the mission identifies none (identification)"
 BAD_FIT = 1e-3
 """p-value below which the finding says that the named nuclide does not fit the spectrum."""
 

@@ -3,6 +3,7 @@
 SCENARIO = "scenario.yaml"
 SUMMARY = "summary.json"
 MISSIONS = "missions.parquet"
+SOURCES = "sources.parquet"
 MEASUREMENTS = "measurements.parquet"
 TRAJECTORIES = "trajectories.parquet"
 SPECTRUM = "spectrum.parquet"

@@ -21,11 +21,17 @@ from swarmsim.config.scenario import Scenario
 from swarmsim.playback import figures
 from swarmsim.playback.recording import write_recording
 from swarmsim.results import names
-from swarmsim.results.batch import batch_row, batch_summary
+from swarmsim.results.batch import batch_row, batch_summary, source_rows
 from swarmsim.results.out_folder import check_out, keep_elsewhere, told_of
 from swarmsim.results.record import MissionRecord, RadiationMap
 from swarmsim.results.summary import Timings, summary
-from swarmsim.results.tables import measurements_table, missions_table, spectrum_table, trajectories_table
+from swarmsim.results.tables import (
+    measurements_table,
+    missions_table,
+    sources_table,
+    spectrum_table,
+    trajectories_table,
+)
 from swarmsim.site.model import SiteModel
 
 _FULL_BYTES = 2_000_000  # less is free where Rerun could not write its next chunk
@@ -50,7 +56,8 @@ def write_run(
 ) -> dict[str, Any]:
     """Write all files of a run to the folder ``out`` and return its summary.
 
-    Of a batch, every mission has a row in ``missions.parquet``; tables, map, recording and figures are the first
+    Of a batch, every mission has a row in ``missions.parquet``, and every source that one found in ``sources.parquet``
+    (which is not there if none did); tables, map, recording and figures are the first
     mission's (any other can be flown again from its seed). A mission that makes no map has no ``radiation_map.npz``.
     The time for writing is measured here.
 
@@ -87,6 +94,7 @@ def _parts(simulation: Built, records: Sequence[MissionRecord], timings: Timings
     """Functions that each write a file of a run into a folder, the summary last, which is returned."""
     first, site, started = records[0], simulation.site_model, time.perf_counter()
     rows = [batch_row(record) for record in records] if len(records) > 1 else []
+    sources = [row for record in records for row in source_rows(record)] if rows else []
 
     def write_scenario(folder: Path) -> None:
         (folder / names.SCENARIO).write_text(simulation.scenario.to_yaml(), encoding="utf-8")
@@ -98,6 +106,8 @@ def _parts(simulation: Built, records: Sequence[MissionRecord], timings: Timings
             pq.write_table(spectrum_table(first, first.spectrum), folder / names.SPECTRUM, compression="zstd")
         if rows:
             pq.write_table(missions_table(rows), folder / names.MISSIONS, compression="zstd")
+        if sources:
+            pq.write_table(sources_table(sources), folder / names.SOURCES, compression="zstd")
 
     def write_map(folder: Path) -> None:
         if first.map is not None:

@@ -42,6 +42,18 @@ _MISSIONS = (
 )
 
 
+_SOURCES = (
+    "sources that the missions of a batch found, a row each: seed and status of the mission; number from 0, the surest "
+    "first; nuclide that it was estimated as; std_ the standard deviations, covariance_ the covariances of the place; "
+    "error_m the distance to the nearest true source, true_nuclide that one's, activity_error_percent against it"
+)
+
+
+def sources_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
+    """One row for each source that missions found (`swarmsim.results.batch.source_rows`), one at least."""
+    return missions_table(rows, _SOURCES)
+
+
 def _metadata(record: MissionRecord, what: str) -> dict[str, str]:
     return {"content": what, "mission": record.name, "site": record.site, "seed": str(record.seed), "frame": _FRAME}
 
@@ -135,7 +147,7 @@ def trajectories_table(record: MissionRecord) -> pa.Table:
     return pa.table(columns, metadata=_metadata(record, "vehicle tracks"))
 
 
-def missions_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
+def missions_table(rows: Sequence[dict[str, Any]], content: str = _MISSIONS) -> pa.Table:
     """One row for each mission, with the columns of all rows; all-null columns stay numeric."""
     columns = {}
     for key in all_keys(rows):
@@ -144,4 +156,4 @@ def missions_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
         columns[key] = (
             pa.array(values, pa.string() if key.endswith("nuclide") else pa.float64()) if empty else pa.array(values)
         )
-    return pa.table(columns, metadata={"content": _MISSIONS, "frame": _FRAME})
+    return pa.table(columns, metadata={"content": content, "frame": _FRAME})

@@ -62,7 +62,8 @@ class _Bars(RichBar):
 class RichProgress:
     """A bar on the terminal for each phase; a context manager, so that the terminal is left as it was.
 
-    Below the bars stand the programs that are being compiled; where there is no terminal, a line tells it once.
+    Below the bars stand the programs that are being compiled. Where there is no terminal, a line tells that once, and
+    a line each which program is compiled and which phase begins.
 
     The speed is simulated time (of all ``missions`` together) over wall time since the first segment of the phase
     ended: the first one may hold the compilation.
@@ -83,7 +84,7 @@ class RichProgress:
         self._horizon_s = 0.0
         self._first: tuple[float, float] | None = None  # wall time and simulated time after the first segment
         self._listening = ExitStack()
-        self._told = False
+        self._told: set[str] = set()
 
     def __enter__(self) -> "RichProgress":
         """Start drawing."""
@@ -105,6 +106,8 @@ class RichProgress:
         self._horizon_s, self._first = simulated_horizon_s, None
         short = name if len(name) <= _NAME_WIDTH else f"{name[: _NAME_WIDTH - 2]} …"
         self._task = self._bar.add_task(short, total=None, simulated="", speed="")
+        if not self._bar.console.is_terminal:
+            self.message(name)
 
     def advance(self, simulated_s: float, done: int, total: int) -> None:
         """Move the bar of the phase."""
@@ -124,8 +127,11 @@ class RichProgress:
 
     def _tell_of_compiling(self) -> None:
         if not self._told:
-            self._told = True
             self.message(COMPILING)
+        for name in COMPILATIONS.under_way()[0]:
+            if name not in self._told:
+                self._told.add(name)
+                self.message(f"compiling {name}")
 
     def _close(self) -> None:
         if self._task is not None:

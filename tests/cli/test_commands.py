@@ -135,6 +135,7 @@ def test_version(capsys: pytest.CaptureFixture[str]) -> None:
         (["run", "recon", "--missions", "0"], "--missions"),
         (["schema", "vehicl"], "vehicle"),
         (["check"], "name at least one file"),
+        (["run", "recon", "recon_paper", "mixed"], "one argument too many, or an unknown one: 'recon_paper', 'mixed'"),
     ],
 )
 def test_a_wrong_command_line(arguments: list[str], fragment: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -127,7 +127,7 @@ def test_a_batch_is_kept_too(kept: Path, record: MissionRecord, site: SiteModel,
     with pytest.raises(InputError):
         write_run(built(site), batch, tmp_path / "disk" / "batch", keep=True)
     (folder,) = kept.iterdir()
-    assert {path.name for path in folder.iterdir()} == ALL | {"missions.parquet"}
+    assert {path.name for path in folder.iterdir()} == ALL | {"missions.parquet", "sources.parquet"}
 
 
 def test_a_recording_that_rerun_cannot_write_is_told(

@@ -130,7 +130,14 @@ def test_a_batch_has_a_row_for_each_mission(record: MissionRecord, site: SiteMod
     nothing = dataclasses.replace(synthetic.mission(found=False, log_hz=5.0, sample_hz=2.0), seed=2)
     batch = [record, dataclasses.replace(record, seed=1), nothing]
     content = write_run(built(site), batch, tmp_path / "batch", TIMINGS)
-    assert {path.name for path in (tmp_path / "batch").iterdir()} == ALL | {"missions.parquet"}
+    assert {path.name for path in (tmp_path / "batch").iterdir()} == ALL | {"missions.parquet", "sources.parquet"}
+    found = pq.read_table(tmp_path / "batch" / "sources.parquet").to_pylist()
+    assert [(row["seed"], row["number"]) for row in found] == [
+        (seed, n) for seed in (0, 1) for n in range(len(record.estimates))
+    ]
+    estimate = record.estimates[0]
+    assert (found[0]["nuclide"], found[0]["east_m"]) == (estimate.nuclide, pytest.approx(estimate.position_m[0]))
+    assert found[0]["std_east_m"] == pytest.approx(float(np.sqrt(estimate.covariance_m2[0][0])))
     table = pq.read_table(tmp_path / "batch" / "missions.parquet")
     assert table["seed"].to_pylist() == [0, 1, 2]
     assert table["source_error_m"].to_pylist() == [pytest.approx(0.25), pytest.approx(0.25), None]
@@ -143,6 +150,7 @@ def test_a_batch_has_a_row_for_each_mission(record: MissionRecord, site: SiteMod
 def test_a_batch_that_found_nothing_keeps_its_columns(site: SiteModel, tmp_path: Path) -> None:
     nothing = synthetic.mission(found=False, log_hz=5.0, sample_hz=2.0)
     write_run(built(site), [nothing, dataclasses.replace(nothing, seed=1)], tmp_path / "batch", TIMINGS)
+    assert not (tmp_path / "batch" / "sources.parquet").exists()
     schema = pq.read_schema(tmp_path / "batch" / "missions.parquet")
     assert str(schema.field("source_error_m").type) == "double"
     assert str(schema.field("nuclide").type) == "string"

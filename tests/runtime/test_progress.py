@@ -46,6 +46,10 @@ def test_it_says_what_is_being_compiled_and_for_how_long(terminal: bool, monkeyp
         assert "compiling" not in screen.getvalue()[before:]
     assert ("compiling for 1:15: estimate, run; later runs" in screen.getvalue()) == terminal
     assert screen.getvalue().count(COMPILING) == (0 if terminal else 1)
+    lines = screen.getvalue().splitlines()
+    assert terminal or [line for line in lines if line in ("prepare", "compiling estimate", "compiling run")] == [
+        "prepare", "compiling estimate", "compiling run",
+    ]  # fmt: skip
 
 
 def test_a_program_is_told_while_it_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
