@@ -14,7 +14,8 @@ class ObstacleMaterial(Model):
 
     ``match`` is a pattern as in a shell (``*``, ``?``), compared without case with the names of the mesh material and
     of the geometry. ``wall_m`` is the thickness of the shell of a hollow thing (a building) or of a sheet; leave it out
-    for a solid one. A ``traversable`` thing does not stop a rover (high grass).
+    for a solid one. Walls that a mesh draws with their own thickness have that, or ``wall_m`` of matter where they are
+    drawn more than three times as thick. A ``traversable`` thing does not stop a rover (high grass).
     """
 
     match: str = Field(min_length=1)

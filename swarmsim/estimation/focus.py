@@ -12,22 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from swarmsim.estimation.forward import Problem, Rates, Rest, Ways, rates, ways_from
+from swarmsim.estimation.forward import Problem, Rates, Rest, rates, silent, ways_from
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
 from swarmsim.estimation.nodes import Span
-from swarmsim.estimation.normal_equations import (
-    Others,
-    linearised,
-    sums_of,
-    told_by_each,
-    unknowns_of,
-)
+from swarmsim.estimation.normal_equations import Others, eliminated, linearised, sums_of, unknowns_of
 from swarmsim.estimation.state import State, without
 
 KEPT = 96  # windows of each span
 ALONG = 1.5  # standard deviations along each axis of what is known of the place, at which windows are looked at
 AROUND_M = 1.0  # and so far off, in modes that there may be beside it
-LEAST_M = 0.02  # at least
+LEAST_STD_M = 0.02  # of the place, at least
 DARK = 1e-3  # of the brightest rate per becquerel: darker windows count as if they were as bright
 
 
@@ -35,42 +29,37 @@ def focused(problem: Problem, state: State, k: jax.Array) -> tuple[Problem, Stat
     """The same with at most `KEPT` windows of each span, those that tell most of source ``k``, and the `Rest`."""
     if all(last - first <= KEPT for first, last, _, _ in problem.spans):
         return problem, state
-    s = state.sources
-    u = replace(state.unknowns, activity_bq=s.activity_bq[k])
-    source, ways, bent = _looked_at(problem, state, k, u.lengths)
-    model = linearised(problem, source, without(state, k).added, ways.position_m, u)
-    rows = _most(problem, told_by_each(problem, model, u) * bent)
-    m = problem.measurements
-    left = replace(problem, measurements=replace(m, valid=m.valid.at[rows].set(False)))
-    information, push = sums_of(left, model, u)
+    others = without(state, k).added
+    u = replace(state.unknowns, activity_bq=state.sources.activity_bq[k])
+    source, log_rates, places = _looked_at(problem, state, k, u.lengths)
+    model = linearised(problem, source, others, places[-1], u)
+    e, sources = eliminated(problem, model, u), u.others.shape[0]
+    # what a straight line about the source would tell wrongly
+    bent = log_rates[:-1] - log_rates[-1] - (places[:-1] - places[-1]) @ model.nearer
+    rows = _most(problem, e.products[0, 0] * jnp.mean(jnp.square(bent), axis=0))
+    information, push = sums_of(problem, model, sources, e, jnp.ones(u.gain.shape).at[rows].set(0.0))
     rest = Rest(information=information, push=push, unknowns=unknowns_of(model, u))
     return replace(_of_rows(problem, rows), rest=rest), _state_of(state, rows)
 
 
-def _looked_at(problem: Problem, state: State, k: jax.Array, lengths: jax.Array) -> tuple[Rates, Ways, jax.Array]:
-    """The rates of source ``k``, the ways from it, and how far its rates [n] are from even about it.
-
-    The latter are mean squares of what the logarithms of rates at places around depart from a straight line by.
-    """
+def _looked_at(problem: Problem, state: State, k: jax.Array, lengths: jax.Array) -> tuple[Rates, jax.Array, jax.Array]:
+    """The rates of source ``k``, and their logarithms [m, n] at places [m, 3] (world) around it, it being the last."""
     place, nuclide = state.sources.place[k], state.sources.nuclide[k]
     known = jnp.diag(jnp.append(jnp.full(2, 1.0 / AROUND_M**2), height_precision(problem.height_std_m)))
     covariance = scaled_inverse(problem.learning_rate * state.sources.towards[k] + known)
-    axes = ALONG * jnp.linalg.cholesky(covariance + (jnp.square(problem.geometry_std_m) + LEAST_M**2) * jnp.eye(3)).T
+    least = jnp.square(problem.geometry_std_m) + LEAST_STD_M**2
+    axes = ALONG * jnp.linalg.cholesky(covariance + least * jnp.eye(3)).T
     wide = AROUND_M * jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-    offsets = jnp.concatenate([axes, -axes, wide, jnp.zeros((1, 3))])  # the source itself is the last one
+    offsets = jnp.concatenate([axes, -axes, wide, jnp.zeros((1, 3))])
 
-    def look(offset: jax.Array) -> tuple[tuple[Rates, Ways], tuple[jax.Array, jax.Array]]:
+    def look(offset: jax.Array) -> tuple[Rates, tuple[jax.Array, jax.Array]]:
         ways = ways_from(problem, place + offset)
         found = rates(problem, ways, nuclide, lengths)
-        return (found, ways), (jnp.sum(found.counts, axis=1), ways.position_m)
+        return found, (jnp.sum(found.counts, axis=1), ways.position_m)
 
-    first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(lambda: look(offsets[0])[0]))
-    (source, ways), (bright, at) = jax.lax.scan(lambda _, offset: look(offset), first, offsets)
-    log_rate = jnp.log(bright + DARK * jnp.max(bright[-1]) + 1e-30)
-    apart = ways.position_m - problem.measurements.position_m
-    nearer = -2.0 * apart / jnp.maximum(jnp.sum(apart * apart, axis=-1, keepdims=True), 0.01)
-    bent = log_rate[:-1] - log_rate[-1] - (at[:-1] - at[-1]) @ nearer.T
-    return source, ways, jnp.mean(jnp.square(bent), axis=0)
+    # a scan keeps the rates of one place alone, and compiles them once
+    source, (bright, places) = jax.lax.scan(lambda _, offset: look(offset), silent(problem), offsets)
+    return source, jnp.log(bright + DARK * jnp.max(bright[-1]) + 1e-30), places
 
 
 def _most(problem: Problem, values: jax.Array) -> jax.Array:

@@ -168,7 +168,7 @@ class NormalEquations:
 
 
 @pytree
-class _Eliminated:
+class Eliminated:
     """Normal equations of the columns of `Linearised` in each window, its own unknowns eliminated."""
 
     products: jax.Array  # [B, B, n]
@@ -180,7 +180,8 @@ class _Eliminated:
     determinant: jax.Array  # [n] of the information about a window's own unknowns
 
 
-def _eliminated(problem: Problem, model: Linearised, u: Unknowns) -> _Eliminated:
+def eliminated(problem: Problem, model: Linearised, u: Unknowns) -> Eliminated:
+    """The windows' own unknowns eliminated at ``u``, where ``model`` is linearised."""
     m, k = problem.measurements, u.others.shape[0]
     assert m.rois is not None
     columns = model.columns
@@ -193,7 +194,7 @@ def _eliminated(problem: Problem, model: Linearised, u: Unknowns) -> _Eliminated
     own, determinant = inverse_of_two(h)
     own_push = of_window(pushes, k) - precision * window_unknowns(u)
     turned = own[:, 0, None] * crossing[0] + own[:, 1, None] * crossing[1]  # [2, B, n]
-    return _Eliminated(
+    return Eliminated(
         products=products - (turned[0][:, None] * crossing[0] + turned[1][:, None] * crossing[1]),
         pushes=pushes - (turned[0] * own_push[0] + turned[1] * own_push[1]),
         own=own,
@@ -208,8 +209,8 @@ def _eliminated(problem: Problem, model: Linearised, u: Unknowns) -> _Eliminated
 def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> NormalEquations:
     """The normal equations at ``u``, where ``model`` is linearised."""
     m, k = problem.measurements, u.others.shape[0]
-    e = _eliminated(problem, model, u)
-    whole, push = _sums(problem, model, k, e)
+    e = eliminated(problem, model, u)
+    whole, push = sums_of(problem, model, k, e)
     if problem.rest is not None:
         more, towards = _of_rest(problem.rest, model, u)
         whole, push = whole + more, push + towards
@@ -234,21 +235,16 @@ def normal_equations(problem: Problem, model: Linearised, u: Unknowns) -> Normal
     )
 
 
-def _sums(problem: Problem, model: Linearised, sources: int, e: _Eliminated) -> tuple[jax.Array, jax.Array]:
-    """Normal equations [P + 3, P + 3], [P + 3] of the unknowns that windows share and the place, without priors."""
+def sums_of(
+    problem: Problem, model: Linearised, sources: int, e: Eliminated, share: jax.Array | float = 1.0
+) -> tuple[jax.Array, jax.Array]:  # fmt: skip
+    """Normal equations [P + 3, P + 3], [P + 3] of the unknowns that windows share and the place, without priors.
+
+    With a ``share`` [n] of each window, and so many ``sources`` besides the one sought.
+    """
     column, factor = _unknowns(problem, model, sources)
-    whole = jnp.sum(e.products[column][:, column] * factor[:, None] * factor, axis=-1)
-    return whole, jnp.sum(e.pushes[column] * factor, axis=-1)
-
-
-def sums_of(problem: Problem, model: Linearised, u: Unknowns) -> tuple[jax.Array, jax.Array]:
-    """`Rest.information` and `Rest.push` of all windows."""
-    return _sums(problem, model, u.others.shape[0], _eliminated(problem, model, u))
-
-
-def told_by_each(problem: Problem, model: Linearised, u: Unknowns) -> jax.Array:
-    """Information [n] that each window has about ln(rate of the source), its own unknowns eliminated."""
-    return _eliminated(problem, model, u).products[0, 0]
+    whole = jnp.sum(e.products[column][:, column] * factor[:, None] * (factor * share), axis=-1)
+    return whole, jnp.sum(e.pushes[column] * (factor * share), axis=-1)
 
 
 def unknowns_of(model: Linearised, u: Unknowns) -> jax.Array:
@@ -279,7 +275,7 @@ def joint_equations(
     others.
     """
     count, levels = u.others.shape[0], len(problem.detectors)
-    e = _eliminated(problem, model, u)
+    e = eliminated(problem, model, u)
     offset = places_m[:, None] - problem.measurements.position_m
     squared = jnp.maximum(jnp.sum(offset * offset, axis=-1, keepdims=True), 0.01)
     nearer = jnp.concatenate([-2.0 * offset / squared, jnp.ones_like(squared)], axis=-1)  # [K, n, 4]

@@ -49,11 +49,6 @@ _SOURCES = (
 )
 
 
-def sources_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
-    """One row for each source that missions found (`swarmsim.results.batch.source_rows`), one at least."""
-    return missions_table(rows, _SOURCES)
-
-
 def _metadata(record: MissionRecord, what: str) -> dict[str, str]:
     return {"content": what, "mission": record.name, "site": record.site, "seed": str(record.seed), "frame": _FRAME}
 
@@ -147,8 +142,18 @@ def trajectories_table(record: MissionRecord) -> pa.Table:
     return pa.table(columns, metadata=_metadata(record, "vehicle tracks"))
 
 
-def missions_table(rows: Sequence[dict[str, Any]], content: str = _MISSIONS) -> pa.Table:
-    """One row for each mission, with the columns of all rows; all-null columns stay numeric."""
+def missions_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
+    """One row for each mission (`swarmsim.results.batch.batch_row`)."""
+    return _table_of(rows, _MISSIONS)
+
+
+def sources_table(rows: Sequence[dict[str, Any]]) -> pa.Table:
+    """One row for each source that missions found (`swarmsim.results.batch.source_rows`), one at least."""
+    return _table_of(rows, _SOURCES)
+
+
+def _table_of(rows: Sequence[dict[str, Any]], content: str) -> pa.Table:
+    """The rows with the columns of all; all-null columns stay numeric."""
     columns = {}
     for key in all_keys(rows):
         values = [row.get(key) for row in rows]

@@ -311,3 +311,21 @@ def test_places_are_weighted_with_all_distributions_that_were_drawn_from():
     found, expected = weights[:drawn].reshape(-1), 1.0 + norm.logpdf(off).sum(axis=1) - np.log(density)
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=2e-3)
     assert np.all(weights[drawn:] == -np.inf)
+
+
+def test_modes_are_taken_in_turn():
+    """Of 96 modes ten metres apart each has had a place beside it once eleven rounds are done."""
+    modes = 10.0 * np.stack(np.meshgrid(np.arange(12), np.arange(8), [1]), axis=-1).reshape(-1, 3)
+    drawn = []
+
+    def weigh(x, _):
+        jax.debug.callback(lambda place: drawn.append(np.asarray(place)), x)
+        return weighed(x, -0.5 * jnp.sum(jnp.square(x / 1e-4)))  # never enough: all rounds are done
+
+    jax.block_until_ready(
+        jax.jit(lambda: sample_posterior(weigh, jnp.zeros(3), jnp.eye(3), 11, 24, jnp.asarray(modes, jnp.float32)))()
+    )
+    jax.effects_barrier()
+    assert len(drawn) == 11 * 24
+    apart = np.linalg.norm(np.array(drawn) - modes[:, None], axis=-1)
+    assert apart.min(axis=1).max() < 1.0
