@@ -87,8 +87,19 @@ settings.register_profile("deterministic", derandomize=True, deadline=None, max_
 settings.load_profile("deterministic")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the files; what is in none of the places named stays as it is."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Choose between those that are done in minutes and all."""
+    parser.addoption("--slow", action="store_true", help="run the tests that take 20 s and more as well")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave slow tests out, unless they or tests by name are asked for; order the files, the rest as they are."""
+    asked = config.getoption("--slow") or config.getoption("-m") or config.getoption("-k")
+    if not asked and not any("::" in name for name in config.args):
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        config.hook.pytest_deselected(items=slow)
+        left_out = set(slow)
+        items[:] = [item for item in items if item not in left_out]
     folder = Path(__file__).parent
     place = {folder / name: number for number, name in enumerate(_FIRST)}
     missing = [str(path) for path in place if not path.is_file()]

@@ -35,6 +35,7 @@ def test_the_python_example_flies_and_steps(capsys, tmp_path, monkeypatch):
     assert (tmp_path / "runs" / "by_hand" / "summary.json").is_file()
 
 
+@pytest.mark.slow
 def test_the_policy_example_climbs_towards_the_source(tmp_path):
     policy = next(text for text in PYTHON if "class Climb" in text)
     (tmp_path / "climb.py").write_text(policy, encoding="utf-8")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.config.mission import Localisation
-from swarmsim.device import for_those
+from swarmsim.device import IN_STEP, for_those, repeat_while
 from swarmsim.estimation.detection_limit import noticed, noticed_from
 from swarmsim.estimation.forward import Problem, models_of, padded, trust_of
 from swarmsim.estimation.importance_sampling import Posterior
@@ -21,10 +21,10 @@ from swarmsim.estimation.likelihood import natural_background, position_covarian
 from swarmsim.estimation.measurements import Measurements, cleared
 from swarmsim.estimation.nodes import Span, nodes_of
 from swarmsim.estimation.pairs import strain
-from swarmsim.estimation.posterior import goodness, of_others, posteriors
+from swarmsim.estimation.posterior import Sampled, goodness, of_others, posteriors
 from swarmsim.estimation.presumed import Presumed
 from swarmsim.estimation.scan import true_counts
-from swarmsim.estimation.seek import SearchParams
+from swarmsim.estimation.seek import HOPELESS, SearchParams
 from swarmsim.estimation.sources import find_sources, needed
 from swarmsim.estimation.state import Sources, State, no_sources
 from swarmsim.pytree import on_host, pytree, static
@@ -34,6 +34,7 @@ TAIL = 4.0  # degrees of freedom of the error of a window's rate: a post between
 WAY_SHARE = 0.05  # of a window's way, by which it departs from a straight one at constant speed
 CONVERGED_EFFECTIVE = 10.0  # weighted places must be worth this many
 HALVES_AGREE = 1.5  # standard deviations between the means of two halves of the places
+TURNS = 2  # that sources are sought and sampled, at most
 UNSURE = 0.25  # standard deviation of a place whose posterior could not be sampled, over the reach of the search
 UNSURE_ACTIVITY = 0.5  # the same of the logarithm of its activity
 
@@ -78,6 +79,9 @@ class Estimated:
     highest_cps: jax.Array  # [D] true rate of the window with the most, by the model, of each detector model
     windows: jax.Array  # [] number of valid ones
     noticed_bq: jax.Array  # [N] from which on a further source in free view would have been noticed; inf: never
+    suspected: jax.Array  # [] ratio of a further one that is not taken for one, over what is asked of a first one
+    suspect_m: jax.Array  # [2] where it may be
+    suspect_nuclide: jax.Array  # [] int32
     unsought: jax.Array  # [] statistic of a further one that is not sought, over what is asked of one (`noticed`)
     state: State  # to go on from when there are more counts
 
@@ -168,8 +172,29 @@ def localise(
             sources=replace(known.sources, place=jnp.where(there, known.sources.place, state.sources.place)),
             unknowns=replace(state.unknowns, level=known.unknowns.level, lengths=known.unknowns.lengths),
         )
-    state = find_sources(problem, presumed.places, nuclides, params.search, state)
-    return _report(presumed, problem, params, state, limits)
+    return _report(presumed, problem, params, _found(presumed, problem, params, state), limits)
+
+
+def _found(presumed: Presumed, problem: Problem, params: LocalisationParams, state: State) -> Sampled:
+    """Sources sought from ``state`` on, and their posteriors.
+
+    Where sampling, which looks at more places, has moved one of several much, the others may have taken up what that
+    one did not explain: all are sought again from there.
+    """
+    nuclides, search = jnp.asarray(presumed.nuclides), params.search
+
+    def turn(at: tuple[Sampled, jax.Array, jax.Array]) -> tuple[Sampled, jax.Array, jax.Array]:
+        found = find_sources(problem, presumed.places, nuclides, search, at[0].state)
+        sampled = posteriors(problem, found, params.sample_rounds, params.samples)
+        gain = 2.0 * (sampled.state.likelihood - found.likelihood)
+        again = (jnp.sum(found.sources.present) > 1) & (gain > HOPELESS * search.further)
+        return sampled, again, at[2] + 1
+
+    shapes = jax.eval_shape(lambda: posteriors(problem, state, params.sample_rounds, params.samples))
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    start = replace(nothing, state=state), jnp.array(True), jnp.int32(0)
+    # a loop, so that both are compiled once
+    return repeat_while(lambda at: at[1] & (at[2] < TURNS), turn, start, IN_STEP)[0]
 
 
 def nothing_found(
@@ -204,6 +229,9 @@ def nothing_found(
         highest_cps=jnp.zeros(len(presumed.detectors)),
         windows=jnp.int32(0),
         noticed_bq=jnp.zeros(np.shape(presumed.nuclides)),
+        suspected=zero,
+        suspect_m=jnp.zeros(2),
+        suspect_nuclide=jnp.int32(0),
         unsought=zero,
         state=jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state),
     )
@@ -229,10 +257,9 @@ def sampled(
 
 
 def _report(
-    presumed: Presumed, problem: Problem, params: LocalisationParams, state: State, limits: jax.Array | bool
+    presumed: Presumed, problem: Problem, params: LocalisationParams, of_all: Sampled, limits: jax.Array | bool
 ) -> Estimated:  # fmt: skip
     site, m = presumed.site, problem.measurements
-    of_all = posteriors(problem, state, params.sample_rounds, params.samples)
     posterior, state = of_all.posterior, of_all.state
     posterior = replace(posterior, effective=jnp.where(of_all.moved, 0.0, posterior.effective))
     state, detection = needed(problem, params.search, state)
@@ -288,6 +315,9 @@ def _report(
         highest_cps=jnp.max(jnp.where(m.valid, rate, 0.0)[:, None] * problem.detector, axis=0),
         windows=jnp.sum(m.valid),
         noticed_bq=limits_bq,
+        suspected=state.suspect.ratio / params.search.threshold,
+        suspect_m=state.suspect.place[:2],
+        suspect_nuclide=state.suspect.nuclide,
         unsought=unsought,
         state=replace(state, sources=ordered(s), added=ordered(state.added)),
     )

@@ -32,9 +32,10 @@ from swarmsim.estimation.weights import drawn_evenly, even_normals, flattened
 
 SCOUTS = 384  # places that are screened at once
 SCOUTED_M = 8.0  # two thirds of them within this distance of the source, the others up to three times as far
+FAR_APART = 4.4  # so much farther apart are the others: two of three on a ninth of the area
 HEIGHTS = 1.5  # standard deviations of the height within which they lie
 CLOSER = 2  # times that as many are screened about the likely ones
-SCATTER_M = 0.6  # standard deviation of their distance from those in each direction
+SCATTER_M = 0.6  # standard deviation of their distance from those in each direction, `FAR_APART` times that far off
 CLOSING_IN = 0.4  # the same each time over that of the time before
 TRUST = 0.5  # power of what the screen finds: it is off by one to two
 LIKELY_SCOUTS = 32.0  # weights of places are flattened until they count as this many
@@ -69,22 +70,32 @@ def _scouted(
     """Likely places [count, 3] around ``place`` [3] and ``across`` [3] the way from it, by the screen."""
     limits, up_m = bounds(problem), HEIGHTS * problem.height_std_m
     around = spread(place, jnp.asarray(SCOUTED_M), up_m, SCOUTS, jnp.zeros(()))
-    std_m = jnp.minimum(SCATTER_M, jnp.stack([jnp.inf, jnp.inf, up_m]))
+    far = jnp.linalg.norm((around - place)[:, :2], axis=1) > SCOUTED_M
+    # the place beyond the way is one of its own, wherever it is
+    apart = jnp.where(far, FAR_APART, 1.0).at[-1].set(1.0)
     trust = TRUST * problem.learning_rate
 
+    def scattered(apart: jax.Array, scale: jax.Array) -> jax.Array:
+        """Standard deviations [SCOUTS, 3] of the places that are drawn about others, ``apart`` [SCOUTS] from these."""
+        wide = SCATTER_M * jnp.stack([apart, apart, jnp.ones(SCOUTS)], axis=1)
+        return scale * jnp.minimum(wide, jnp.stack([jnp.inf, jnp.inf, up_m]))
+
     def step(
-        known: tuple[jax.Array, jax.Array], draws: tuple[jax.Array, jax.Array]
-    ) -> tuple[tuple[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+        known: tuple[jax.Array, jax.Array, jax.Array], draws: tuple[jax.Array, jax.Array]
+    ) -> tuple[tuple[jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
         """From places and the logarithms of the density that they were drawn from, to those drawn about likely ones."""
-        (places, log_density), (normal, scale) = known, draws
+        (places, apart, log_density), (normal, scale) = known, draws
         log_posterior = trust * each(lambda x: screened(problem, screen, nuclide, x), places, TOGETHER)
-        weight = flattened(log_posterior - log_density, LIKELY_SCOUTS)
-        drawn = jnp.clip(places[drawn_evenly(weight, SCOUTS)] + scale * std_m * normal, *limits)
-        off = jnp.sum(jnp.square((drawn[:, None] - places) / (scale * std_m)), axis=-1)
-        return (drawn, jax.scipy.special.logsumexp(jnp.log(weight) - 0.5 * off, axis=1)), (places, weight)
+        weight, std_m = flattened(log_posterior - log_density, LIKELY_SCOUTS), scattered(apart, scale)
+        chosen = drawn_evenly(weight, SCOUTS)
+        drawn = jnp.clip(places[chosen] + std_m[chosen] * normal, *limits)
+        off = jnp.sum(jnp.square((drawn[:, None] - places) / std_m), axis=-1)
+        of_each = jnp.log(weight) - jnp.sum(jnp.log(std_m), axis=1)
+        log_density = jax.scipy.special.logsumexp(of_each - 0.5 * off, axis=1)
+        return (drawn, apart[chosen], log_density), (places, weight)
 
     draws = even_normals(CLOSER + 1, SCOUTS), CLOSING_IN ** jnp.arange(CLOSER + 1.0)
-    start = jnp.clip(around.at[0].set(place).at[-1].set(across), *limits), jnp.zeros(SCOUTS)
+    start = jnp.clip(around.at[0].set(place).at[-1].set(across), *limits), apart, -2.0 * TRUST * jnp.log(apart)
     places, weight = jax.tree.map(lambda x: x[-1], jax.lax.scan(step, start, draws)[1])
     return places[drawn_evenly(weight, count)]
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from swarmsim.device import each
 from swarmsim.estimation.fit import Settled, settle
-from swarmsim.estimation.forward import Problem, Rates, rates, ways_from, with_one_ray
+from swarmsim.estimation.forward import Problem, Rates, dead_time, rates, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.normal_equations import (
     MEAN_FLOOR,
@@ -35,6 +35,7 @@ STEPS = 4  # Gauss-Newton steps at a place
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
 ROUNDING = 1e-5  # of sums over all windows, relative
 FARTHEST = 6.0  # standard deviations of a place within which others are looked for along its uncertainty
+NEAREST_M = 0.1  # of a window from a source: nearer ones tell no more
 TOGETHER = 24  # places that an accelerator looks at side by side
 
 Bounds = tuple[jax.Array, jax.Array]  # lower and upper [3]
@@ -252,18 +253,24 @@ def mirrored_place(problem: Problem, place: jax.Array, counts: jax.Array) -> jax
 
 
 def heard_most_at(problem: Problem, place: jax.Array, counts: jax.Array) -> jax.Array:
-    """Where [3] (x, y, height above the ground) most of a source's ``counts`` [n] came from.
+    """Where [3] (x, y, height above the ground) a source at ``place`` [3] was heard from that its ``counts`` [n] tell.
 
-    The mean of the windows' places, weighted as by `mirrored_place`; ``place`` [3] is the source's.
+    The mean of the windows' places, weighted with the squares of what each tells of the distance: those of a vehicle
+    that stood beside the source, and not the many that flew by above with as many counts. What an overloaded counter
+    does not register tells nothing.
     """
     m = problem.measurements
     offset = jnp.where(m.valid[:, None], m.position_m - position_of(problem.site, place), 0.0)
-    found = position_of(problem.site, place) + _shares_of(problem, counts) @ offset
+    total = counts + jnp.sum(problem.background, axis=1)
+    share, fall = dead_time(problem, total)
+    registered = jnp.abs(share + fall * total) * counts
+    told = jnp.where(m.valid, registered / jnp.maximum(jnp.sum(jnp.square(offset), axis=1), NEAREST_M**2), 0.0)
+    found = position_of(problem.site, place) + _shares_of(problem, told) @ offset
     return found.at[2].add(-sample(problem.site.terrain_m, problem.site, found[:2]))
 
 
 def _shares_of(problem: Problem, counts: jax.Array) -> jax.Array:
-    """Shares [n] of the windows, as the squares of their ``counts`` [n]; 0 of those that are not valid."""
+    """Shares [n] of the windows, as the squares of their ``counts`` [n] or the like; 0 of those not valid."""
     weight = jnp.square(
         jnp.where(problem.measurements.valid, counts / jnp.maximum(jnp.max(counts), 1e-9), 0.0)
     )  # fmt: skip

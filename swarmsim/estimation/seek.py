@@ -18,7 +18,7 @@ from swarmsim.estimation.normal_equations import Others
 from swarmsim.estimation.overload import prominent
 from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
 from swarmsim.estimation.starts import STARTS, Places, Starts, no_starts, starts_of
-from swarmsim.estimation.state import State, shared, without
+from swarmsim.estimation.state import State, Suspect, nobody, shared, without
 from swarmsim.pytree import pytree, static
 
 PART = 12  # candidates in each part of a round, at least
@@ -59,8 +59,12 @@ def sought(
     slot: jax.Array,
     adding: jax.Array,
     wide: jax.Array,
-) -> tuple[State, jax.Array]:
-    """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one."""
+    least: jax.Array,
+) -> tuple[State, jax.Array, Suspect]:
+    """The state with a source in ``slot`` sought, a new one or that one again; and whether [] there is one.
+
+    A new one is if twice the logarithm of its likelihood ratio exceeds ``least`` []. The best there is comes last.
+    """
     others = without(state, slot).added
     starts, statistic = for_those(
         adding | wide,
@@ -68,20 +72,24 @@ def sought(
         lambda: (no_starts(places), jnp.zeros(())),
     )
 
-    def look() -> tuple[State, jax.Array]:
+    def look() -> tuple[State, jax.Array, Suspect]:
         best, values = _best(problem, starts, allowed, params, state, others, slot, adding, wide)
         ratio = 2.0 * (best.fit.likelihood - state.likelihood)
         # what is sought again stays where it is rather than at a place that explains much less
-        found = ratio > jnp.where(adding, least_of(params, state), -HOPELESS * params.further)
+        found = ratio > jnp.where(adding, least, -HOPELESS * params.further)
         fit = best.fit
         found &= ~adding | prominent(problem, fit.unknowns.activity_bq * fit.rates.counts, others)
         after = with_source(problem, state, slot, best)
         table = after.sources.nuclide_value.at[slot].set(values)
         after = replace(after, sources=replace(after.sources, nuclide_value=table))
-        return jax.tree.map(partial(jnp.where, found), after, state), found
+        return (
+            jax.tree.map(partial(jnp.where, found), after, state),
+            found,
+            Suspect(ratio=ratio, place=best.place, nuclide=best.nuclide),
+        )
 
     worth = ~adding | (statistic > PROMISING * params.threshold)
-    return for_those(worth, look, lambda: (state, jnp.array(False)), IN_STEP)
+    return for_those(worth, look, lambda: (state, jnp.array(False), nobody()), IN_STEP)
 
 
 def least_of(params: SearchParams, state: State) -> jax.Array:
@@ -235,4 +243,4 @@ def with_source(problem: Problem, state: State, k: jax.Array, best: Tried) -> St
             variance_of(problem, position_of(problem.site, best.place)) + best.fit.rates.edge
         ),
     )
-    return State(sources=sources, added=added, unknowns=shared(u), likelihood=best.fit.likelihood)
+    return replace(state, sources=sources, added=added, unknowns=shared(u), likelihood=best.fit.likelihood)

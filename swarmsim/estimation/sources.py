@@ -13,15 +13,16 @@ import jax.numpy as jnp
 from swarmsim.device import IN_STEP, for_those, repeat_while
 from swarmsim.estimation.forward import Problem
 from swarmsim.estimation.pairs import are_mixed, divided, divisible, joined, strain
-from swarmsim.estimation.seek import HOPELESS, SearchParams, sought, with_source
+from swarmsim.estimation.seek import HOPELESS, SearchParams, least_of, sought, with_source
 from swarmsim.estimation.starts import Places
-from swarmsim.estimation.state import State, ratios, settled, signals, without
+from swarmsim.estimation.state import State, Suspect, nobody, ratios, settled, signals, without
 from swarmsim.pytree import pytree
 
 TRIAL = 10.0  # times the threshold: the ratio of a source below which it is tried whether it can be done without
 SEEKS_PER_SOURCE = 6  # on average, at most
 DIVISIONS = 4  # of one into two, or of two into other two, at most
 MIXINGS = 4  # times that two of different nuclides are placed together, at most
+ADVANCES = 2  # times that others are sought beside a further source that does not explain enough yet, at most
 RELAXED = 0.5
 """Of the strain before, what two of different nuclides that are placed together may leave at most.
 
@@ -38,11 +39,13 @@ class _Progress:
     again: jax.Array  # [K] bool, sources that are to be sought again, the others held
     wide: jax.Array  # [] bool, whether they are sought as far as a new one
     trial: jax.Array  # [] bool, whether ``state`` lacks a source that `before` has
+    advanced: jax.Array  # [] bool, whether it has one that `before` lacks and that does not explain enough yet
     before: State
     over: jax.Array  # [] bool
     left: jax.Array  # [] int32, seeks at most
     divisions: jax.Array  # [] int32, how often one may still be taken for two, or two be placed anew
     mixings: jax.Array  # [] int32, how often two of different nuclides may still be placed together
+    advances: jax.Array  # [] int32, how often one may still be taken for such a source
     made: jax.Array  # [K] bool, sources that the last division made
     closing: jax.Array  # [] bool, whether companions have been joined: no more sources are added
 
@@ -50,10 +53,11 @@ class _Progress:
 def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: SearchParams, state: State) -> State:
     """Seek the sources of ``state`` again, then add others until no further one explains the counts beyond chance.
 
-    After each that is added the others are sought again. Then the one that is missed least is left out for a trial: the
-    first source found between two others is none, and the others, sought again, explain the counts as well. In the end
-    one is taken for two where that is what the counts ask for, and companions are taken away
-    (`swarmsim.estimation.pairs`).
+    After each that is added the others are sought again, and then that one beside them. Then the one that is missed
+    least is left out for a trial: the first source found between two others is none, and the others, sought again,
+    explain the counts as well. One found between two keeps the second from explaining what is asked of it: a further
+    source that explains part of that is taken for one if all of them, sought again from everywhere, do. In the end one
+    is taken for two where that is what the counts ask for, and companions are taken away (`swarmsim.estimation.pairs`).
 
     Args:
         problem: the data.
@@ -65,33 +69,46 @@ def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: S
     s = state.sources
     zero = jnp.zeros_like(s.joined_m)
     fresh = replace(s, joined_m=zero, beside_m=zero, beside_bq=zero)
-    state = replace(state, sources=fresh)
+    state = replace(state, sources=fresh, suspect=nobody())
     first = settled(problem, replace(state, added=signals(problem, state.sources, state.unknowns.lengths)))
     no = jnp.array(False)
     start = _Progress(
         state=first, again=first.sources.present, wide=~no, trial=no, before=first, over=no,
         left=jnp.int32(SEEKS_PER_SOURCE * params.sources_max), divisions=jnp.int32(DIVISIONS), closing=no,
         mixings=jnp.int32(MIXINGS), made=jnp.zeros_like(first.sources.present),
+        advanced=no, advances=jnp.int32(ADVANCES),
     )  # fmt: skip
 
     def step(p: _Progress) -> _Progress:
         adding = ~jnp.any(p.again)
         slot = jnp.where(adding, jnp.argmin(p.state.sources.present), jnp.argmax(p.again))
-        state, found = sought(problem, places, allowed, params, p.state, slot, adding, p.wide)
+        asked = least_of(params, p.state)
+        advance = adding & jnp.any(p.state.sources.present) & (p.advances > 0)
+        least = jnp.where(advance, HOPELESS, 1.0) * asked
+        state, found, best = sought(problem, places, allowed, params, p.state, slot, adding, p.wide, least)
+        advance &= found & (best.ratio < asked)
+        suspect = jax.tree.map(partial(jnp.where, adding & ~found), best, state.suspect)
+        state = replace(state, suspect=suspect)
         present = state.sources.present
         mine = jnp.arange(present.shape[0]) == slot
-        again = jnp.where(adding & found, present, p.again) & ~mine
+        # a new one as well, once it stands beside others: before, it explained what these did where they were
+        beside = adding & found & (jnp.sum(present) > 1)
+        again = jnp.where(adding & found, present, p.again) & (beside | ~mine)
         done = ~jnp.any(again) & (found | ~adding)
-        wide = p.wide & jnp.any(again) & ~adding
+        wide = advance | (p.wide & jnp.any(again) & ~adding)
+        before = jax.tree.map(partial(jnp.where, advance), p.state, p.before)
         p = replace(p, state=state, again=again, wide=wide, over=adding & ~found, left=p.left - 1)
-        untried = done & ~p.trial & ~p.closing & (jnp.sum(present) >= 2)
+        p = replace(p, before=before, advanced=p.advanced | advance, advances=p.advances - advance)
+        untried = done & ~p.trial & ~p.closing
         p = _ended_trial(params.further, p, done & p.trial)
+        p = _ended_advance(params, p, done & p.advanced)
+        untried &= ~p.over & (jnp.sum(p.state.sources.present) >= 2)
         p = _begun_trial(problem, params, p, untried)
         full = (jnp.all(p.state.sources.present) | p.closing) & ~jnp.any(p.again)
         spent = p.left <= 0
         # a trial that found no end has shown nothing
-        state = jax.tree.map(partial(jnp.where, spent & p.trial), p.before, p.state)
-        p = replace(p, state=state, trial=p.trial & ~spent, over=p.over | full | spent)
+        state = jax.tree.map(partial(jnp.where, spent & (p.trial | p.advanced)), p.before, p.state)
+        p = replace(p, state=state, trial=p.trial & ~spent, advanced=p.advanced & ~spent, over=p.over | full | spent)
         return _joined(problem, _divided(problem, params, p))
 
     return _believed(problem, params, repeat_while(lambda p: ~p.over, step, start, IN_STEP).state)
@@ -211,6 +228,17 @@ def _ended_trial(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
     needless = 2.0 * (p.before.likelihood - p.state.likelihood) < least
     kept = jax.tree.map(partial(jnp.where, now & ~needless), p.before, p.state)
     return replace(p, state=kept, trial=p.trial & ~now, divisions=_divisions(p, now & needless & gone))
+
+
+def _ended_advance(params: SearchParams, p: _Progress, now: jax.Array) -> _Progress:
+    """``now``: the sources with the further one if all explain enough; else those before, and no more."""
+    gain = 2.0 * (p.state.likelihood - p.before.likelihood)
+    short = now & (gain < params.further)
+    s = p.state.sources
+    new = jnp.argmax(s.present & ~p.before.sources.present)
+    before = replace(p.before, suspect=Suspect(ratio=gain, place=s.place[new], nuclide=s.nuclide[new]))
+    kept = jax.tree.map(partial(jnp.where, short), before, p.state)
+    return replace(p, state=kept, advanced=p.advanced & ~now, over=p.over | short)
 
 
 def _divisions(p: _Progress, removed: jax.Array) -> jax.Array:

@@ -30,6 +30,15 @@ class Sources:
 
 
 @pytree
+class Suspect:
+    """A further source, the best there is, whether or not it explains enough."""
+
+    ratio: jax.Array  # [] twice the logarithm of the likelihood ratio against the same without it; 0: none was sought
+    place: jax.Array  # [3] x, y, height above the ground
+    nuclide: jax.Array  # [] int32
+
+
+@pytree
 class State:
     """Sources, and the fit of all of them."""
 
@@ -37,6 +46,7 @@ class State:
     added: Others  # what they add; nothing for those that are not there
     unknowns: Unknowns  # its own activity is zero: that of the sources stands there
     likelihood: jax.Array  # []
+    suspect: Suspect  # that is not taken for a source
 
 
 def no_sources(problem: Problem, count: int, nuclides: int) -> State:
@@ -59,7 +69,13 @@ def no_sources(problem: Problem, count: int, nuclides: int) -> State:
         ),
         unknowns=nothing_known(problem, count),
         likelihood=-jnp.asarray(jnp.inf),
+        suspect=nobody(),
     )
+
+
+def nobody() -> Suspect:
+    """No further source."""
+    return Suspect(ratio=jnp.zeros(()), place=jnp.zeros(3), nuclide=jnp.int32(0))
 
 
 def signals(problem: Problem, s: Sources, lengths: jax.Array) -> Others:
@@ -91,7 +107,7 @@ def settled(problem: Problem, state: State) -> State:
     u, likelihood = without_more(problem, state.added, state.unknowns, ALONE_STEPS)
     sources = replace(state.sources, activity_bq=state.sources.activity_bq * u.others)
     added = replace(state.added, counts=state.added.counts * u.others[:, None, None])
-    return State(sources=sources, added=added, unknowns=shared(u), likelihood=likelihood)
+    return replace(state, sources=sources, added=added, unknowns=shared(u), likelihood=likelihood)
 
 
 def shared(u: Unknowns) -> Unknowns:

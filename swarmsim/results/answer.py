@@ -197,6 +197,10 @@ def _verdict(
         chi_squared=float(estimated.chi_squared),
         strain=float(estimated.strain),
         unsought=float(estimated.unsought),
+        suspected=float(estimated.suspected),
+        suspect="{} near ({:.0f}, {:.0f})".format(
+            _nuclides(simulation)[int(estimated.suspect_nuclide)], *np.asarray(estimated.suspect_m, float)
+        ),
         full=len(final) == simulation.plan.localisation.search.sources_max,
         load=float(np.max(np.asarray(estimated.highest_cps) / doubtful, initial=0.0)),
     )

@@ -45,6 +45,10 @@ APART_SIGMA = 5.0  # between the estimates from the air and from all counts
 MODEL_STD_M, MODEL_STD_LOG = 0.5, 0.1  # errors that the two estimates have not in common, in place and in activity
 EXCLUDED = "the counts show a source of a nuclide that is not in question (knowledge.nuclides)"
 MORE = "as many sources are found as are sought (localisation.sources_max), so that there may be more"
+SUSPECTED = (
+    "a further source is suspected, perhaps of {}: with it the counts are explained better than chance allows, but no "
+    "better than errors of the model may (localisation.further_sigma)"
+)
 UNEXPLAINED_M = 25.0  # a hotspot farther from the estimate is not explained by it
 UNEXPLAINED_SIGMA = 3.0  # of the background: a hotspot that exceeds it by less may be of the background
 
@@ -57,6 +61,8 @@ class Fit:
     chi_squared: float  # over its degrees of freedom
     strain: float = 0.0  # what rates depart from the model by, beyond what is usual (`Estimated.strain`)
     unsought: float = 0.0  # `Estimated.unsought`
+    suspected: float = 0.0  # `Estimated.suspected`
+    suspect: str = ""  # what that would be: "K-40 near (10, -3)"
     full: bool = False  # as many sources are found as are sought
     load: float = 0.0  # highest true rate of a counter by them, over that at which it shows `SATURATED_SHARE`
 
@@ -126,6 +132,8 @@ def assess(
     doubts += unsure_nuclides(final, examined, suggested) + unusual_heights(final, heights)
     if fit.full and (len(final) > 1 or fit.unsought > 1.0):  # who seeks one knows that there is one
         doubts.append(("ambiguous", MORE))
+    if final and not fit.full and fit.suspected > 1.0:
+        doubts.append(("ambiguous", SUSPECTED.format(fit.suspect)))
     if not final and fit.unsought > 1.0:
         doubts.append(("inconsistent", EXCLUDED))
     if doubts and status in ("located", "none"):

@@ -104,6 +104,7 @@ def test_setpoints_stop_at_once_when_the_operator_takes_over(live):
     assert link.armed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "reason", "last"),
     [
@@ -172,6 +173,7 @@ def test_a_vehicle_under_way_is_not_taken(live):
     assert link.asked == []
 
 
+@pytest.mark.slow
 def test_a_vehicle_whose_phase_begins_later_waits_on_the_ground(late):
     link, when = FakeLink(), {}
     flight, error, _ = flown(late, link, during=lambda flight, link: when.update(armed=link.armed))

@@ -56,6 +56,7 @@ def eventually(condition, seconds=5.0):
         time.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_a_vehicle_holds_while_its_next_phase_is_planned_and_flies_it_then(twice, planning):
     link, seen = FakeLink(), {}
 
@@ -77,6 +78,7 @@ def test_a_vehicle_holds_while_its_next_phase_is_planned_and_flies_it_then(twice
     assert min(s.position_m[1] for _, s in link.sent if s.position_m is not None) < -44.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [({"battery": 0.1}, "battery"), ({"estimate": False}, "estimate"), ({"heard": False}, "no heartbeat")],

@@ -72,6 +72,7 @@ def mission(tmp_path, monkeypatch):
     sys.setswitchinterval(interval)
 
 
+@pytest.mark.slow
 def test_a_dry_run_prints_table_and_map_and_sends_nothing(capsys):
     assert main(["fly", "block.yaml", "--vehicle", "uav", "--dry-run"]) == 0
     said = capsys.readouterr().out
@@ -80,6 +81,7 @@ def test_a_dry_run_prints_table_and_map_and_sends_nothing(capsys):
     assert "S" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("autopilot", "vehicle"), [("px4", "uav"), ("ardupilot", "rover")])
 def test_a_vehicle_flies_its_part_of_the_mission(autopilot, vehicle, tmp_path, capsys):
     with standing_in(autopilot, flies=vehicle == "uav") as (standin, link):
@@ -134,6 +136,7 @@ def in_flight(standin, then):
     threading.Thread(target=wait, daemon=True).start()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("autopilot", "what", "reason"),
     [

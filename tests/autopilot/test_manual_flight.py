@@ -105,6 +105,7 @@ def moved(link, pilot, sticks, seconds):
     return np.array(link.telemetry().position_m) - before
 
 
+@pytest.mark.slow
 def test_taken_over_and_handed_back_the_mission_goes_on(uav):
     seen = {}
 
@@ -165,6 +166,7 @@ def test_flown_by_hand_from_the_ground_up_and_landed(uav):
     assert np.array(flight.log.rows)[-1, 8] > -73.0
 
 
+@pytest.mark.slow
 def test_a_rover_is_driven_and_goes_on(rover):
     seen = {}
 
@@ -216,6 +218,7 @@ def test_a_lost_device_holds_and_the_operator_still_takes_over(uav):
     assert "somebody else" in flight.helm.line()
 
 
+@pytest.mark.slow
 def test_a_pilot_who_flies_past_the_end_of_the_mission_flies_on(uav):
     settings = QUICK.model_copy(update={"at_end": "land"})
 

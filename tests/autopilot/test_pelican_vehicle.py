@@ -15,6 +15,7 @@ from swarmsim.autopilot.standin.pelican import PelicanStandin, PelicanStandinSet
 from tests.autopilot.stick_peers import airborne, pelican_link, pelican_peer, until
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("switch", ["gps", "height", "attitude"])
 def test_it_climbs_goes_where_it_is_told_and_lands(switch, tmp_path):
     log = tmp_path / "flight.log"

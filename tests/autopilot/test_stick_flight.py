@@ -61,6 +61,7 @@ def flown(live, link, happens=None):
     return flight, error
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ardrone2", "pelican"])
 def test_a_vehicle_flies_its_part_and_lands(live, kind):
     with opened(kind) as (peer, link):
@@ -76,6 +77,7 @@ def test_a_vehicle_flies_its_part_and_lands(live, kind):
     assert [what for _, what in flight.log.events][-1] == "landed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "happens", "reason"),
     [

@@ -67,6 +67,7 @@ def _counter(model):
     return detectors, known, np.asarray(mean_rois(SITE, detectors, FLIGHT)), all_of(limit_of), all_of(ratio_of)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["nai_1p5x1p5", "geiger_sbm20"])
 @pytest.mark.parametrize("at", [(10.0, 4.0, 1.0), (-33.0, 28.0, 1.0), (39.0, -39.0, 1.0)])
 def test_a_source_at_its_detection_limit_is_noticed_nineteen_times_of_twenty(at, model):
@@ -99,6 +100,7 @@ def test_most_places_reach_the_limit_that_is_told():
     assert np.isinf(np.delete(np.asarray(one), CO_60)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("measured", "least", "most"), [(60, 1.0, 1.0), (30, 1.5, np.inf), (0, np.inf, np.inf)])
 def test_the_fewer_places_were_measured_the_higher_is_the_limit(measured, least, most):
     @jax.jit
@@ -114,6 +116,7 @@ def test_the_fewer_places_were_measured_the_higher_is_the_limit(measured, least,
     assert np.all(part <= 1.001 * most * whole)
 
 
+@pytest.mark.slow
 def test_an_accelerator_tells_the_same_limits_of_many_missions(monkeypatch):
     def told(rois):
         problem, state = _nothing(rois)
@@ -174,6 +177,7 @@ def test_beside_a_source_that_overloads_a_counter_only_what_is_believed_is_notic
     assert 0.94 <= np.mean(shares > 0.3 - 1e-3) < 1.0
 
 
+@pytest.mark.slow
 def test_a_straight_way_is_counted_as_the_places_along_it():
     """Windows of a slow counter are metres long."""
     at, nuclide = jnp.array([3.0, 4.0, 1.0]), jnp.int32(CO_60)

@@ -54,6 +54,7 @@ def test_sparse_counts_raise_no_false_alarms_either():
     assert float(jnp.mean(jax.jit(lambda k: jax.lax.map(mission, k, batch_size=64))(keys))) < 0.01
 
 
+@pytest.mark.slow
 def test_two_sources_are_two_hotspots_strongest_first():
     site, detectors, flight = place(), (detector(),), survey(altitude=10.0)
     truth = [((-35.0, 20.0, 0.5), 60e6), ((30.0, -25.0, 0.5), 120e6)]

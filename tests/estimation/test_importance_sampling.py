@@ -160,6 +160,7 @@ def two_modes(turn):
     return weigh
 
 
+@pytest.mark.slow
 def test_what_places_are_worth_does_not_depend_on_how_many_there_might_be():
     """Sampling ends when there are enough, in five rounds or so."""
     found = [
@@ -235,6 +236,7 @@ def _of_a_place_and_a_room(share, centre, modes):
     return sample_posterior(weigh, jnp.zeros(3), 0.09 * jnp.eye(3), 40, 24, modes)
 
 
+@pytest.mark.slow
 def test_of_modes_that_are_given_each_has_its_share_of_the_posterior():
     """A source is where the search found it or in a building ten metres off: no place drawn about the one is there."""
     rng = np.random.default_rng(3)

@@ -42,6 +42,7 @@ def told(site, sources, knowledge=None, background=BACKGROUND, flight=FLIGHT):
     return presumed(site, DETECTORS, half=40.0, knowledge=knowledge), m
 
 
+@pytest.mark.slow
 def test_a_source_decays_while_it_is_sought():
     """F-18 of a survey of half an hour was told 13 % too weak, and metres off."""
     half_life_s = 40.0

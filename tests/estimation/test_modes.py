@@ -44,6 +44,7 @@ def among_walls(seed):
     return problem, _state(problem, jnp.asarray(grid[np.argmax(value)])), grid, float(problem.learning_rate) * value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_all_that_is_likely_is_among_them(seed):
     problem, state, grid, value = among_walls(seed)

@@ -53,6 +53,7 @@ def test_beside_a_source_that_overloads_a_counter_a_faint_one_is_not_believed():
         assert bool(prominent(problem, 0.01 * added, alone))
 
 
+@pytest.mark.slow
 def test_an_accelerator_begins_fits_of_many_missions_alike(monkeypatch):
     """Of some that overloaded a counter and others that did not."""
     means = [mean_rois(SITE, DETECTORS, FLIGHT, [(AT, activity, "Co-60")]) for activity in (2e8, 1e11, 3e12)]

@@ -123,6 +123,7 @@ def test_the_one_that_explains_less_is_taken_away_whatever_its_activity(monkeypa
     assert int(jnp.sum(after.present)) == 1
 
 
+@pytest.mark.slow
 def test_a_source_is_divided_where_two_others_beside_one_another_are_right():
     """Strain comes from the third, that is two 4 m apart: it is divided, and not the pair placed anew."""
     pair = [(np.array([-35.0, -30.0, 1.0]), 300e6), (np.array([-35.0, -20.0, 1.0]), 300e6)]
@@ -140,6 +141,7 @@ def test_a_source_is_divided_where_two_others_beside_one_another_are_right():
     np.testing.assert_allclose(found, SOURCE[0] + np.array([-2.0, 2.0]), atol=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("apart", "off"), [(0.0, (4.0, 4.3)), (0.0, (-3.0, 2.0)), (2.0, (4.0, 4.0)), (5.0, (-1.5, 8.0))]
 )
@@ -190,6 +192,7 @@ def test_a_height_that_is_known_is_not_left_for_two_nuclides():
     np.testing.assert_allclose(before + two.offset_m, [two.place, two.second.place], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_two_nuclides_in_one_place_are_found_in_it(localiser):
     """The survey has them metres apart, and the first that is sought by all counts goes to the other."""
     counts = drawn(BOTH, mean_rois(SITE, DETECTORS, BOTH, [(AT, 150e6, "Co-60"), (AT, 250e6, "Cs-137")]), 2)
@@ -220,6 +223,7 @@ def test_two_nuclides_are_placed_together_if_that_is_what_was_wrong(monkeypatch,
     p = sources._Progress(
         state=state, again=jnp.zeros(2, bool), wide=no, trial=no, before=state, over=jnp.array(not mixed),
         left=jnp.int32(9), divisions=jnp.int32(3), mixings=jnp.int32(2), made=jnp.ones(2, bool), closing=no,
+        advanced=no, advances=jnp.int32(0),
     )  # fmt: skip
     with jax.disable_jit():
         after = sources._divided(problem, PARAMS.search, p)
@@ -323,7 +327,9 @@ def test_what_is_sought_again_does_not_go_where_it_explains_less(monkeypatch):
         fit = replace(tried.fit, likelihood=state.likelihood - loss)
         elsewhere = replace(tried, place=tried.place + 3.0, fit=fit)
         monkeypatch.setattr(seek, "_best", lambda *_, found=elsewhere: (found, jnp.zeros(len(NUCLIDES))))
-        after, _ = seek.sought(problem, KNOWN.places, allowed, PARAMS.search, state, jnp.int32(0), no, no)
+        after, _, _ = seek.sought(
+            problem, KNOWN.places, allowed, PARAMS.search, state, jnp.int32(0), no, no, PARAMS.search.further
+        )
         assert bool(jnp.allclose(after.sources.place[0], tried.place)) == stays
 
 
@@ -333,7 +339,7 @@ def test_what_a_division_made_and_a_trial_refuted_is_not_made_again():
     begun = sources._Progress(
         state=one, again=jnp.zeros(2, bool), wide=jnp.array(False), trial=jnp.array(True), before=two,
         over=jnp.array(False), left=jnp.int32(9), divisions=jnp.int32(3), made=jnp.ones(2, bool),
-        mixings=jnp.int32(0), closing=jnp.array(False),
+        mixings=jnp.int32(0), closing=jnp.array(False), advanced=jnp.array(False), advances=jnp.int32(0),
     )  # fmt: skip
     least, now = PARAMS.search.further, jnp.array(True)
     assert int(sources._ended_trial(least, begun, now).divisions) == 0

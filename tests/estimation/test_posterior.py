@@ -92,6 +92,7 @@ def integral(problem, state, reach):
     return mean, np.sqrt(variance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("boxes", [[], WALLS])
 def test_sampling_moves_a_source_that_the_search_left_beside_its_place(boxes):
     problem, at_its_place = told(boxes, 0)
@@ -106,23 +107,26 @@ def test_sampling_moves_a_source_that_the_search_left_beside_its_place(boxes):
     np.testing.assert_allclose(found.state.sources.activity_bq[0], ACTIVITY, rtol=0.15)
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    ("boxes", "rate", "reach", "near"), [([], 1.0, 4.5, 0.15), ([], 0.4, 7.2, 0.15), (WALLS, 1.0, 1.7, 0.25)]
+    ("boxes", "rate", "reach", "near", "usually"),
+    [([], 1.0, 4.5, 0.2, 0.1), ([], 0.4, 7.2, 0.2, 0.1), (WALLS, 1.0, 1.7, 0.35, 0.2)],
 )
-def test_moments_are_those_of_the_integral(boxes, rate, reach, near, seed):
-    problem, state = told(boxes, seed)
-    problem = replace(problem, learning_rate=jnp.float32(rate))
-    mean, std = integral(problem, state, reach)
-    found = _sample(problem, state)
-    sampled = np.sqrt(np.diag(found.covariance))
-    assert np.all(np.abs(np.asarray(found.mean)[:2] - mean[:2]) < near * std[:2])
-    assert abs(float(found.mean[3]) - mean[3]) < near * float(sampled[3])
-    # beside walls the weights are flattened until they are worth enough places: wider, never narrower
-    assert np.all(sampled[:2] > 0.75 * std[:2])
-    assert np.all(sampled[:2] < (1.4 if boxes else 1.2) * std[:2])
-    np.testing.assert_allclose(sampled[3], std[3], rtol=0.15)
-    assert float(found.effective) > 16.0
+def test_moments_are_those_of_the_integral(boxes, rate, reach, near, usually):
+    off = []
+    for seed in range(5):
+        problem, state = told(boxes, seed)
+        problem = replace(problem, learning_rate=jnp.float32(rate))
+        mean, std = integral(problem, state, reach)
+        found = _sample(problem, state)
+        sampled = np.sqrt(np.diag(found.covariance))
+        off.append((np.asarray(found.mean) - mean)[[0, 1, 3]] / [*std[:2], sampled[3]])
+        # beside walls the weights are flattened until they are worth enough places: wider, never narrower
+        assert np.all(sampled[:2] > 0.75 * std[:2])
+        assert np.all(sampled[:2] < (1.4 if boxes else 1.2) * std[:2])
+        np.testing.assert_allclose(sampled[3], std[3], rtol=0.15)
+        assert float(found.effective) > 16.0
+    assert np.max(np.abs(off)) < near
+    assert np.max(np.sqrt(np.mean(np.square(off), axis=0))) < usually
 
 
 def test_the_prior_of_the_activity_counts_in_full_at_any_learning_rate():
@@ -137,6 +141,7 @@ def test_the_prior_of_the_activity_counts_in_full_at_any_learning_rate():
     np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)[:2]), std[:2], rtol=0.2)
 
 
+@pytest.mark.slow
 def test_the_mean_does_not_depend_on_where_sampling_starts():
     problem, state = told(WALLS, 1)
     std = integral(problem, state, 1.7)[1][:2]
@@ -147,6 +152,7 @@ def test_the_mean_does_not_depend_on_where_sampling_starts():
     assert np.all(np.ptp(np.asarray(means), axis=0) < 0.4 * std)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_source_beside_a_straight_way_may_lie_on_either_side_of_it(seed):
     way = np.column_stack([np.linspace(-30.0, 30.0, 231), np.full(231, 4.0), np.full(231, 0.6)])
@@ -169,6 +175,7 @@ def test_without_any_measurement_the_moments_are_finite():
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(found))
 
 
+@pytest.mark.slow
 def test_a_straight_way_does_not_tell_its_sides_apart():
     """A rover drives past a source on level ground: both sides of its way are as likely."""
     site = place([])

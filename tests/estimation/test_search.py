@@ -47,6 +47,7 @@ def _fitted(known, m, places):
     return jax.lax.map(one, places)
 
 
+@pytest.mark.slow
 def test_a_few_steps_come_as_far_as_many_wherever_the_source_is_sought():
     """Places up to 9 m off, where windows are off by factors of ten."""
     known, m = told(WALLS)
@@ -93,6 +94,7 @@ def test_places_along_the_uncertainty_follow_its_ridge(reach):
     assert across < 0.05 * along
 
 
+@pytest.mark.slow
 def test_what_is_sought_again_is_named_again():
     """It was named where it was sought at first, which may have been metres off."""
     known, m = told(WALLS)
@@ -108,7 +110,7 @@ def test_what_is_sought_again_is_named_again():
         wrong = replace(wrong, activity_bq=jnp.array([4e8]))
         state = settled(problem, replace(nothing, sources=wrong, added=signals(problem, wrong, jnp.zeros(2))))
         no, allowed = jnp.array(False), jnp.ones(len(NUCLIDES), bool)
-        return seek(problem, known.places, allowed, params, state, jnp.int32(0), no, no)[0].sources
+        return seek(problem, known.places, allowed, params, state, jnp.int32(0), no, no, params.further)[0].sources
 
     after = sought(known, m)
     assert NUCLIDES[int(after.nuclide[0])] == "Co-60"

@@ -52,6 +52,7 @@ def assert_equal(found, expected):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=3e-4, err_msg=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("portions", [[FRAMES], [1] * FRAMES, [0, 13, 40, 7]])
 def test_windows_equal_the_sums_of_all_samples_in_any_portions(portions):
     taken, new = samples()

@@ -20,6 +20,7 @@ def experiment():
     return module
 
 
+@pytest.mark.slow
 def test_the_net_rate_above_the_source_is_that_of_the_crystal(experiment):
     physical = experiment.net_rate_above_source(swarmsim.build(swarmsim.load("recon")))
     ideal = experiment.net_rate_above_source(swarmsim.build(swarmsim.load("recon_paper")))

@@ -42,6 +42,7 @@ def agrees(found: Seen, expected: Tally) -> None:
     assert float(found.scattered[0]) == pytest.approx(float(expected.total), abs=4.0 * error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "metres", "energy"), [("concrete", 0.1, 662.0), ("steel", 0.02, 160.0)])
 def test_a_very_wide_box_is_a_slab(library: Library, name: str, metres: float, energy: float) -> None:
     tables = medium(library.material(name), energy)
@@ -129,6 +130,7 @@ def test_a_building_is_closed_where_it_says(building: Building) -> None:
         assert crossed(corners, inside, inside + np.array(way))[0] == pytest.approx(0.0 if open_ else building.wall_m)
 
 
+@pytest.mark.slow
 def test_the_commands_write_their_tables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -163,6 +165,7 @@ ON_SOIL = {  # building and energy: counts over those of the bare source, from 2
 """The Monte Carlo of `enclosures` with the source in the middle, 100,000 photons: known to 3 %."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "energy"), ON_SOIL)
 def test_a_building_holds_back_what_the_ground_scatters(name: str, energy: float) -> None:
     """As bright as in the open below a source, the ground would make it 1.7 times too much from above."""

@@ -30,6 +30,7 @@ PUBLISHED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "energy"), PUBLISHED)
 def test_published_exposure_build_up(library: Library, name: str, energy: float) -> None:
     material = library.material(name)
@@ -40,6 +41,7 @@ def test_published_exposure_build_up(library: Library, name: str, energy: float)
     np.testing.assert_allclose(1.0 + np.asarray(scattered)[::2], PUBLISHED[name, energy], rtol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "metres", "energy"), [("concrete", 0.10, 662.0), ("lead", 0.002, 160.0)])
 def test_the_tables_are_what_it_gives(library: Library, name: str, metres: float, energy: float) -> None:
     material = library.material(name)

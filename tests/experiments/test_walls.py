@@ -104,6 +104,7 @@ def test_the_ground_adds_what_it_scatters(library: Library, detector: Detector) 
     assert 0.8 < ground[places[:, 2] == 30.0].max() < 1.0  # 662 keV, from above
 
 
+@pytest.mark.slow
 def test_the_command_tells_cases_and_fits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,6 +117,7 @@ def test_the_command_tells_cases_and_fits(
     assert [w.shape for w in made.weights] == [w.shape for w in network().weights]
 
 
+@pytest.mark.slow
 def test_the_fit_finds_the_photons_of_the_cases() -> None:
     """Cases whose counts are those of the project's network, a tenth of them too faint to be known."""
     rng = np.random.default_rng(SEED)

@@ -174,6 +174,7 @@ def test_nuclides_are_those_with_a_strong_line(yard):
     assert drawn >= strong - {min(strong)}
 
 
+@pytest.mark.slow
 def test_missions_of_a_family_fly_by_the_same_programs(standing):
     standing.rollout(range(BATCH), values={"sources.0.activity_mbq": [1000.0] * BATCH})
     batch = standing.rollout(range(BATCH, 2 * BATCH))
@@ -188,6 +189,7 @@ SOURCES = "sources=[" + ", ".join(
 ) + "]"  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_was_drawn_is_flown_and_written(standing, tmp_path):
     batch = standing.rollout(range(BATCH))
     records = [swarmsim.mission_record(standing, batch, k) for k in range(BATCH)]

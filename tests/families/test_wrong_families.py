@@ -68,6 +68,7 @@ def test_wrong_families_are_told_in_a_sentence(path, distribution, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 def test_no_room_for_sources_and_parts_varied_twice_are_told():
     base = ["vary.sources={count: [12, 12]}", "engine=analytic"]
     crowded = "vary.sources.*.position_m={place: {region: indoors, apart_m: 60}}"

@@ -87,6 +87,7 @@ def survey():
     return simulation, measured(jax.jit(windows)(keys[0]), 0), jax.device_get(fits)
 
 
+@pytest.mark.slow
 def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
     simulation, windows, fits = survey
     world, plan = simulation.world, simulation.plan

@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import swarmsim
 from swarmsim.estimation import Measurements
@@ -36,6 +37,7 @@ def around(place, radius_m: float, detector: int) -> Measurements:
     )
 
 
+@pytest.mark.slow
 def test_a_source_is_identified_as_the_crystal_saw_it() -> None:
     """From the side of the crystal X-rays of Eu-152 count a third more: end on, the same spectrum would fit badly."""
     simulation = swarmsim.build(swarmsim.load("recon", ["engine=analytic", SOURCE]))

@@ -59,6 +59,7 @@ def cost_of(jaxpr, seen):
     return total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["recon", "mixed", "landing", "swarm"])
 def test_kernels_of_a_mission_are_compiled_in_seconds(name, monkeypatch):
     simulation = swarmsim.build(swarmsim.load(name))

@@ -11,6 +11,7 @@ from swarmsim.missions.begin import begin_mission
 from swarmsim.runtime.fingerprint import fingerprint
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "values",
     [[], ["knowledge.nuclides=[Cs-137, Co-60]", "knowledge.site=terrain", "localisation.sources_max=2"]],

@@ -91,6 +91,7 @@ def together(climbing):
     return climbing.rollout([0, 3, 5])
 
 
+@pytest.mark.slow
 def test_a_users_policy_from_a_file_flies(climbing, together):
     for index in range(3):
         record = swarmsim.mission_record(climbing, together, index)
@@ -119,6 +120,7 @@ def test_decision_periods_in_one_call_are_those_of_a_call_each(climbing, togethe
         np.testing.assert_array_equal(*(record.samples.counts for record in records))
 
 
+@pytest.mark.slow
 def test_a_policy_is_asked_at_its_period_and_told_of_each_reading_once(tmp_path):
     """Every tick; every third of them, which falls between judgements; and every second judgement."""
     (tmp_path / "my.py").write_text(LISTEN, encoding="utf-8")
@@ -250,6 +252,7 @@ TEAMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("team", TEAMS)
 def test_every_team_moves(team, tmp_path):
     (tmp_path / "my.py").write_text(MOVE, encoding="utf-8")
@@ -281,6 +284,7 @@ class Move:
 '''
 
 
+@pytest.mark.slow
 def test_a_vehicle_without_a_detector_flies(tmp_path):
     bare = (
         "  - {name: a, type: bare, position_m: [-190, 40]}\n  - {name: b, type: tarot_t650, position_m: [-180, 40]}\n"
@@ -305,6 +309,7 @@ def test_a_vehicle_without_a_detector_flies(tmp_path):
     assert all(vehicle.position_m[-1, 2] - vehicle.position_m[0, 2] > 1.0 for vehicle in record.vehicles)
 
 
+@pytest.mark.slow
 def test_stepping_by_hand_scans_and_batches(climbing):
     world = climbing.world
     missions, ticks = 3, 100
@@ -335,6 +340,7 @@ def test_stepping_by_hand_scans_and_batches(climbing):
     np.testing.assert_array_equal(np.asarray(fresh).sum(axis=1), ticks // 9)  # a sample each 0.09 s
 
 
+@pytest.mark.slow
 def test_a_policy_reads_the_sensors_that_it_says_it_senses(tmp_path):
     """Two UAVs climb by their barometers; messages of the receiver come at its rate, each reading is fresh once."""
     (tmp_path / "my.py").write_text(SENSING, encoding="utf-8")

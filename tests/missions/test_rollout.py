@@ -37,6 +37,7 @@ def records(simulation, batch):
     return [swarmsim.mission_record(simulation, batch, index) for index in range(2)]
 
 
+@pytest.mark.slow
 def test_validation_knows_that_the_source_can_be_found(simulation, batch, records):
     ratios = detectable_ratios(simulation, batch)
     assert [ratio.shape for ratio in ratios] == [(1,), (1,)]
@@ -178,6 +179,7 @@ def test_no_activity_is_a_clear_finding(simulation):
     assert np.ptp(rover.position_m[:, :2], axis=0).max() < 0.05
 
 
+@pytest.mark.slow
 def test_a_run_is_written_whole_and_flies_again(simulation, records, tmp_path):
     swarmsim.write_run(simulation, records, tmp_path / "first")
     rows = pq.read_table(tmp_path / "first" / MISSIONS).to_pylist()

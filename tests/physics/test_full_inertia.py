@@ -79,6 +79,7 @@ def test_what_no_body_has_is_refused(numbers, message):
         as_file(numbers)
 
 
+@pytest.mark.slow
 @engines
 def test_flight_is_that_of_mujoco_c_with_the_full_tensor(engine):
     """Three seconds under the loads of `step_loads`, which MuJoCo C integrates by Runge and Kutta's method."""

@@ -264,6 +264,7 @@ def test_sweeps_need_no_new_compilation(engine):
     assert run._cache_size() == 1
 
 
+@pytest.mark.slow
 @engines
 def test_gradients_are_finite_and_right(engine):
     params, ground = params_of(effects=PLAIN), plane()

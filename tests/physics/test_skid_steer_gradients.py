@@ -90,6 +90,7 @@ def differences(engine):
     return np.swapaxes((after - before) / (2.0 * step[:, None]), 1, 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_derivatives_equal_central_differences(engine, mode):

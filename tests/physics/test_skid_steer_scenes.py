@@ -118,6 +118,7 @@ def walled(shape, angle, distance, cells=101, cell=0.25):
     return dataclasses.replace(plane_site(cells=cells, cell=cell), clearance_m=jnp.asarray(clearance, jnp.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("shape", "deepest", "often"), [(straight, 0.005, 0), (concave, 0.005, 0), (convex, 0.025, 6)])
 def test_random_walls_hold_at_up_to_2_m_s(engine, shape, deepest, often):

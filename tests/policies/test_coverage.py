@@ -111,6 +111,7 @@ def homes_in_a_row(count):
     return np.stack([np.full(count, -38.0), np.linspace(-24.0, 24.0, count) + 0.3], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sweep", [0.0, 0.7])
 @pytest.mark.parametrize(
     ("x", "y", "count", "bands"),

@@ -75,6 +75,7 @@ def test_no_move_leads_across_a_wall_of_one_cell(slanted):
     assert np.isfinite(cost[route[:, 0], route[:, 1]]).all()
 
 
+@pytest.mark.slow
 def test_a_route_leads_round_vehicles_that_stand_on_it():
     start, size = (-30.0, 4.0), 0.9
     places = (np.array([[-10.0, 3.8], [20.0, 30.0]]), np.array([[-10.0, 3.8], [10.0, 8.0]]))
@@ -89,6 +90,7 @@ def test_a_route_leads_round_vehicles_that_stand_on_it():
         assert length < 1.05 * np.linalg.norm(np.diff(straight, axis=0), axis=1).sum() + 2.0
 
 
+@pytest.mark.slow
 def test_a_rover_leaves_from_beside_a_vehicle_and_has_no_way_where_these_enclose_it():
     beside = np.asarray(drive((-30.0, 4.0), TARGET, block_site([]), standing=[(-28.8, 4.0, 0.9)]).points_m)[:, :2]
     np.testing.assert_allclose(beside[0], [-30.0, 4.0], atol=1e-3)

@@ -228,6 +228,7 @@ def flown(tmp_path_factory):
     return simulation, [swarmsim.mission_record(simulation, batch, index) for index in range(4)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", range(3))
 def test_it_lands_on_a_rover_and_is_carried_to_the_end_of_its_way(flown, index):
     simulation, records = flown

@@ -34,6 +34,7 @@ def test_efficiency_from_the_dimensions(library: Library, size_mm: float) -> Non
         assert interacts * float(full) == pytest.approx(peak, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_new_size_is_right_by_itself(library: Library) -> None:
     """A 1 x 1 inch crystal detects 0.482 of the photons of 662 keV; its housing lets 0.98 of them through."""
     spec = load_named("detectors", "nai_1p5x1p5").model_copy(update={"diameter_mm": 25.4, "length_mm": 25.4})

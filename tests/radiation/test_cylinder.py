@@ -77,6 +77,7 @@ def test_counts_against_rays(u: float, distance: float) -> None:
     np.testing.assert_allclose(fraction_counted(A, L, distance, u, ATTENUATIONS), counted, rtol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("radius", "length", "least", "most"),
     [(0.005, 0.091, 1e6, 1e6), (0.0254, 0.0508, 14.0, 1e4), (0.0191, 0.0381, 14.0, 1e4)],

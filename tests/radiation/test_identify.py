@@ -60,6 +60,7 @@ def run(detector: Detector, counts: np.ndarray, live_s: float) -> Identification
     return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(counts)], *parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["physical", "paper_ideal"])
 @pytest.mark.parametrize("wall_m", [0.0, 0.1])
 def test_every_shipped_nuclide_is_identified(library: Library, detectors: Detectors, kind: str, wall_m: float) -> None:
@@ -281,6 +282,7 @@ def test_drift_of_the_gain_is_found(library: Library, detectors: Detectors, gain
     assert np.median(found.gain) == pytest.approx(gain, abs=0.006)
 
 
+@pytest.mark.slow
 def test_a_stranger_is_unknown(library: Library) -> None:
     """A nuclide that the tables lack: unknown at 1500 counts, and what the tables hold is not."""
     strangers = ("Cs-137", "Zn-65", "Tc-99m", "F-18", "Bi-207")

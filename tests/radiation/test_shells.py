@@ -48,6 +48,7 @@ def counts(detector: Detector, site: Site, a: object, b: object) -> tuple[np.nda
     return np.asarray(direct), np.asarray(scattered)
 
 
+@pytest.mark.slow
 def test_foliage_behind_a_wall_is_no_wall(detector: Detector) -> None:
     """It is 3 kg/m3: 24 kg/m2 against 460 of the concrete."""
     source, place = (-10.0, 0.0, 0.0), (20.0, 0.0, 0.3)
@@ -60,6 +61,7 @@ def test_foliage_behind_a_wall_is_no_wall(detector: Detector) -> None:
         assert behind < bare
 
 
+@pytest.mark.slow
 def test_a_sheet_of_steel_counts_before_a_thicker_board(detector: Detector) -> None:
     steel = ((-8.0, 0.0, 0.0), (0.02, 1.0, 1.0), 0.0, "steel")
     board = ((10.0, 0.0, 0.0), (0.06, 30.0, 30.0), 0.0, "wood")
@@ -82,6 +84,7 @@ def test_a_detector_in_a_house_counts_as_one_outside_does_from_within(detector: 
         assert (np.abs(np.log(into / out)) < np.log(1.6)).all(), (place, into / out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [0.0, 45.0, 60.0])
 @pytest.mark.parametrize(("half", "wall"), [((8.0, 50.0, 3.0), 0.1), ((8.0, 50.0, 3.0), 0.3), ((0.2, 50.0, 50.0), 0.0)])
 def test_counts_change_steadily_as_a_source_goes_into_a_wall(

@@ -54,6 +54,7 @@ def test_what_is_left_out_is_a_stranger(detectors: Detectors) -> None:
     assert strangers == set(few.known_names) - {"Co-60"}
 
 
+@pytest.mark.slow
 def test_a_nuclide_of_the_list_is_unknown_and_named_as_alike(library: Library, detectors: Detectors) -> None:
     """600 counts each, bare and behind 5 mm of steel, on a background of twice the rate: no name of the library."""
     detector, names = detectors["nai_2x2", "physical"], ("Sb-124", "Tl-201", "In-111", "Co-58", "Au-198", "Y-88")

@@ -67,6 +67,7 @@ def test_vehicles_have_the_error_of_the_geometry_in_common(simulation):
     np.testing.assert_allclose(covariance, expected, atol=0.07 * alike)
 
 
+@pytest.mark.slow
 def test_the_sensitivity_is_what_counts_have(simulation):
     world, made = simulation.world, departures(simulation)
     exact = replace(world, departures=replace(world.departures, sensitivity_std=jnp.zeros(())))

@@ -48,6 +48,7 @@ def record(simulation: swarmsim.Simulation, flown: tuple) -> swarmsim.MissionRec
     return swarmsim.record_steps(simulation, flown[1], seed=3)
 
 
+@pytest.mark.slow
 def test_the_track_is_what_was_observed(record: swarmsim.MissionRecord, flown: tuple) -> None:
     (vehicle,) = record.vehicles
     state = flown[0].groups[0].vehicle

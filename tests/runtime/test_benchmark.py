@@ -48,6 +48,7 @@ def test_the_command_compares_one_mission_with_a_batch(
         assert fragment in printed
 
 
+@pytest.mark.slow
 def test_the_command_measures_a_fleet_in_both_layouts(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

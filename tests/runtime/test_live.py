@@ -39,6 +39,7 @@ def flown(live, moved=lambda body: body, seconds=100.0):
     return np.array(inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["uav2", "orpheus"])
 def test_a_vehicle_that_is_where_the_simulation_has_it_flies_the_same_mission(simulation, vehicle):
     live = LiveMission(simulation, 3, vehicle)
@@ -55,6 +56,7 @@ def test_a_vehicle_that_is_where_the_simulation_has_it_flies_the_same_mission(si
     np.testing.assert_allclose([p.end_s for p in ours.phases], [p.end_s for p in theirs.phases], atol=0.06)
 
 
+@pytest.mark.slow
 def test_nothing_that_the_simulation_would_have_happen_to_it_happens(simulation):
     live = LiveMission(simulation, 3, "uav1")
     live.prepare()

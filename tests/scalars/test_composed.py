@@ -52,6 +52,7 @@ def test_branches():
     assert "cond" in str(jax.make_jaxpr(shared)(True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unroll", [0, 16])
 @pytest.mark.parametrize("length", [0, 1, 4])
 def test_scans(unroll, length):
@@ -131,6 +132,7 @@ def test_missions_outside_with_large_arrays():
         assert_alike(*(jax.vmap(f(one, (0, None, 0)), axes)(*args) for f in (over_vehicles, jax.vmap)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", PLATFORMS)
 def test_derivatives_outside(platform):
     mapped = partial(over_vehicles, platform=platform)
@@ -212,6 +214,7 @@ def fleet():
     return params, state, memory, setpoint, draw(3.0), ground
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_controlled_multirotor(engine):
     params, state, memory, *rest = fleet()

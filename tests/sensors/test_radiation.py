@@ -98,6 +98,7 @@ def read(field, way):
     return jax.tree.map(np.asarray, sampled(field, way, ALWAYS, jax.random.key(0)))
 
 
+@pytest.mark.slow
 def test_an_exposure_has_its_time_its_way_and_its_mean_place(field, way, read):
     reading, _ = read
     (ends,) = np.nonzero(reading.fresh[:, 0])
@@ -197,6 +198,7 @@ def test_a_detector_faster_than_the_judging_is_refused():
         world(row("uav", "tarot_t650", 1, (0.0, 0.0)), timing={"judge_period_s": 0.1})
 
 
+@pytest.mark.slow
 def test_each_group_counts_with_its_own_detector():
     made = team()
     silent = replace(made, sources=replace(made.sources, activity_bq=jnp.zeros_like(made.sources.activity_bq)))

@@ -183,6 +183,7 @@ def test_gradient_equals_difference():
     np.testing.assert_allclose(gradient, difference, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_thread_for_each_segment_crosses_the_same():
     """The way of an accelerator, evaluated without one, for several beginnings at once."""
     rng = np.random.default_rng(2)
@@ -209,6 +210,7 @@ def test_a_thread_for_each_segment_crosses_the_same():
     assert float(expected.shape.scattered.min()) < -0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("together", ["on lines", "anywhere"])
 def test_clusters_that_are_left_out_are_not_crossed(together):
     """Many boxes, thin and long, hollow and solid, from places within and beside them: as of each segment alone."""
@@ -243,6 +245,7 @@ def test_clusters_that_are_left_out_are_not_crossed(together):
     assert 0.1 < float(crosses) < 1.0
 
 
+@pytest.mark.slow
 def test_an_end_that_is_no_number_hides_nothing_from_its_neighbours():
     site = make_site([((5.0, 0.0, 1.0), (0.5, 20.0, 3.0), 0.0, 0.0, "concrete")])
     ends = jnp.array([[10.0, y, 1.0] for y in np.linspace(-3.0, 3.0, 16)], jnp.float32)
@@ -257,6 +260,7 @@ def test_an_end_that_is_no_number_hides_nothing_from_its_neighbours():
     assert expected[:, CONCRETE].min() > 0.9
 
 
+@pytest.mark.slow
 def test_what_is_wanted_is_crossed_as_if_all_were():
     site = make_site([((5.0, 0.0, 1.0), (0.5, 20.0, 3.0), 0.0, 0.0, "concrete")])
     start = jnp.array([0.0, 0.0, 1.0])

@@ -238,6 +238,7 @@ def wander(site, params, start_m, yaw, key, engine):
     return jax.lax.scan(leg, states, jax.random.split(key, LEGS))[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "engine"), [(0, "analytic"), (3, "analytic"), (1, "mjx")])
 def test_no_rover_crosses_a_thin_wall(tmp_path, seed, engine):
     """A raster of half-metre cells let a third of them through."""

@@ -45,6 +45,7 @@ def test_the_axes_of_a_box_are_alike():
     np.testing.assert_allclose(mirrored, expected, rtol=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "last"),
     [

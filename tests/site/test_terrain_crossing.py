@@ -90,6 +90,7 @@ def test_what_counts_as_clear_is_above_the_ground():
         assert float(share[until >= 1.0].max()) == 0.0
 
 
+@pytest.mark.slow
 def test_a_bank_of_a_metre_on_a_ray_of_a_hundred():
     """Closed form: a ridge one cell to each side, 2 m high, crossed half way up, has half its width of 2 m there."""
     ny, nx = 9, 241
@@ -117,6 +118,7 @@ def test_its_gradient_is_that_of_differences(seed):
         assert wrong.mean() < 0.1
 
 
+@pytest.mark.slow
 def test_gradients_go_through_reverse_and_forward():
     site, (a, *_), (b, *_) = hills(3), ends(5, 1), ends(6, 1)
     b = b.at[2].set(-1.0)

@@ -96,6 +96,7 @@ def test_what_is_beyond_all_that_it_was_fitted_to_is_as_at_the_end():
     np.testing.assert_array_equal(ends, found)
 
 
+@pytest.mark.slow
 def test_no_building_scatters_out_of_all_proportion():
     """Of a hundred thousand lines at random, through walls up to the depth that is fitted to."""
     rng, n = np.random.default_rng(5), 100_000

@@ -178,6 +178,7 @@ def test_a_session_whose_firmware_did_not_start_is_replaced_when_asked(folder):
     assert list((folder / "out").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_session_from_start_to_report(folder, monkeypatch, capsys):
     (folder / "peer.py").write_text(PEER, encoding="utf-8")
     port = free_port(socket.SOCK_STREAM)

@@ -53,6 +53,7 @@ def hover_of(scenario):
     return float(speed / spec.rotor.speed_max_rad_s)
 
 
+@pytest.mark.slow
 def test_at_rest_the_sensors_read_the_place(plant):
     for _ in range(500):
         t = plant.step(np.zeros((2, ACTUATORS)))

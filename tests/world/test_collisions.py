@@ -40,6 +40,7 @@ def met(b, dense_max=256):
     return collide(b, candidates(b.position_m, every, every, jnp.float32(3.0), 48, dense_max), DT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dense_max", [256, 0])
 def test_momentum_is_conserved_and_nobody_gains_energy(dense_max):
     """Crowds of random vehicles, of which a third touch somebody."""
@@ -62,6 +63,7 @@ def test_momentum_is_conserved_and_nobody_gains_energy(dense_max):
     assert 200 < touched < 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spin", [1.0, 5.0, 15.0])
 def test_spinning_pairs_that_touch_gain_no_energy(spin):
     draw = np.random.default_rng(6)
@@ -148,6 +150,7 @@ def gaps(position):
     return np.where(np.abs((one - other)[..., 2]) < 2 * HALF_M, level, np.inf)
 
 
+@pytest.mark.slow
 def test_uavs_that_fly_into_each_other_fall_apart(place):
     """Head on, from behind, crossing and grazing: nobody passes through, and both are out of action."""
     made, start = place

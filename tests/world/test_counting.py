@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from swarmsim.world.counting import counted
 from tests.world.worlds import begin, row, with_group, world
@@ -21,6 +22,7 @@ def read(made, state, active_after):
     return jax.jit(lambda: counted(made, group, state.key, first, 5, running, before, after, seen).counter.reading)()
 
 
+@pytest.mark.slow
 def test_an_exposure_counts_for_a_vehicle_that_had_a_part_until_it_came_to_rest_at_the_end_of_the_period():
     made = world(row("uav", "tarot_t650", 3, (-5.0, 0.0)), sources=[SOURCE])
     state = with_group(begin(made, jax.random.key(0)), 0, active=jnp.array([True, True, False]))

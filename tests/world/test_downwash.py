@@ -93,6 +93,7 @@ def test_the_wind_carries_the_jet_along_and_a_moving_vehicle_leaves_it_behind():
         assert aside[speed.argmax()] == pytest.approx(sign * 3.0 * age, abs=0.03)
 
 
+@pytest.mark.slow
 def test_the_momenta_of_several_jets_add_and_both_searches_agree():
     draw = np.random.default_rng(2)
     place = jnp.asarray(draw.uniform([0, 0, 0], [12, 12, 12], (80, 3)), jnp.float32)
@@ -137,6 +138,7 @@ def test_a_vehicle_without_numbers_takes_the_downwash_from_nobody():
     assert felt[0] == pytest.approx(air_at([0, 0, -2.0])[0, 1], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_one_that_has_no_part_any_more_blows_at_nobody():
     team = row("uav", "x500", 2, (-20.0, -15.0), spacing_m=9.0)
     made = world(team, blocks=(), sample_period_s={"nai_1p5x1p5": 1.0}, wind={"speed_m_s": 0.0, "gusts": False})
@@ -149,6 +151,7 @@ def test_one_that_has_no_part_any_more_blows_at_nobody():
         assert -float(groups[0].around.wind_m_s[1, 2]) == pytest.approx(air, abs=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", [True, False])
 def test_one_that_hovers_below_another_sinks_and_comes_back(on):
     team = row("uav", "x500", 3, (-20.0, -15.0), spacing_m=9.0)

@@ -64,6 +64,7 @@ def test_only_the_first_event_ends_a_vehicles_part():
     assert set(events.DESCRIPTIONS) == set(events.KINDS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", range(JUDGE_TICKS))
 def test_a_hard_drop_is_recorded_at_every_phase_of_the_judging_period(world, start, rest, offset):
     clearance = np.linspace(0.5, 2.5, UAVS) + 0.07 * offset

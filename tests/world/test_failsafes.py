@@ -47,6 +47,7 @@ def go(places, velocity):
     return jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b[1:]]), moves, stay)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("heading_deg", [0, 90, 180, 270, 37])
 def test_a_vehicle_that_flies_on_to_the_border_returns_and_lands_at_home(place, heading_deg):
     made, start = place
@@ -104,6 +105,7 @@ def test_a_lost_link_returns_only_after_its_time(place):
     assert np.linalg.norm(tracks[0].position_m[-1, 0, :2] - home) < 10.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [7.0, 15.0])
 def test_too_strong_a_wind_makes_it_land_where_it_is(speed):
     team = row("uav", "x500", COUNT, (-20.0, -15.0), spacing_m=9.0)
@@ -121,6 +123,7 @@ def test_too_strong_a_wind_makes_it_land_where_it_is(speed):
     assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["analytic", "mjx"])
 def test_one_that_has_to_land_goes_where_nothing_stands(engine):
     """Over the house, beside its wall, over open ground, and at the fence."""

@@ -66,6 +66,7 @@ def with_gradients(field, inputs):
     return value, jax.vmap(lambda output: pull(output)[0])(jnp.eye(OUTPUTS))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ["analytic", "mjx"])
 def test_gradients_equal_central_differences(engine):
     uav = row("uav", "tarot_t650", 1, (0.4, 0.2))

@@ -19,6 +19,7 @@ def _turned(made):
     return replace(made, groups=(replace(group, params=params), *others))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("engine", "turned"), [("analytic", False), ("analytic", True), ("mjx", False), ("mjx", True)])
 def test_every_function_over_vehicles_is_a_kernel(engine, turned, monkeypatch):
     team = row("uav", "tarot_t650", 3, (-30.0, -20.0)) + row("rover", "orpheus", 2, (-30.0, 0.0))

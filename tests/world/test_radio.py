@@ -45,6 +45,7 @@ def after(world, state, periods, key=0):
     return state.radio
 
 
+@pytest.mark.slow
 def test_the_nearest_in_range_are_heard_as_they_are():
     field = team(range_m=15.0)
     state = at(field, begin(field, jax.random.key(0)), PLACES, rates=(100.0, 200.0, 300.0))

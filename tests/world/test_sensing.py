@@ -244,6 +244,7 @@ def test_readings_are_those_of_the_seed_and_of_the_vehicle(world, flight) -> Non
     np.testing.assert_allclose(sensed_along(alone, state, short)[0].gyro_rad_s[:, 0], one.gyro_rad_s[:, 3], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_group_whose_vehicles_differ_reads_zero_for_what_one_lacks(world) -> None:
     others = {"uav0": (), "uav1": ("icm_20948",), "uav3": ("tfmini",), "rover0": (), "rover1": ()}
     sensors = fit_sensors(CASE, world, others=others)

@@ -42,6 +42,7 @@ def inside(position):
     return np.minimum.reduce([x - WEST, EAST - x, y - SOUTH, NORTH - y, ROOF_M - z])
 
 
+@pytest.mark.slow
 def test_what_falls_on_a_roof_rests_on_it(place):
     made, start = place
     draw = np.random.default_rng(1)
@@ -140,6 +141,7 @@ def test_two_that_lie_in_each_other_come_apart_and_rest(place):
     assert np.abs(tracks[0].velocity_m_s[-1]).max() < 0.02
 
 
+@pytest.mark.slow
 def test_between_two_walls_one_comes_to_rest():
     """In slots of 1.25 to 2.25 m, whose middle has no nearest wall."""
     slots = [(-20.0 + 12.0 * k, 1.25 + 0.25 * k) for k in range(5)]

@@ -67,6 +67,7 @@ def test_lines_and_areas_follow_the_ground_and_keep_their_activity():
     assert seen == pytest.approx(1e8 * angle / (4 * np.pi * h * 20.0), rel=2e-3)  # photons per m2 and decay
 
 
+@pytest.mark.slow
 def test_a_line_gives_the_rate_of_the_integral_over_its_length():
     line = {"nuclide": "Co-60", "line_m": ((-20.0, 12.0), (0.0, 12.0)), "height_m": 0.5, "activity_mbq": 100.0}
     made = world(row("uav", "tarot_t650", 1, (-5.0, 0.0)), sources=[line])
@@ -93,6 +94,7 @@ def carried(on, **team):
     return world(members, sources=[SPRING, source], sample_period_s={"nai_1p5x1p5": 0.1}, **team)
 
 
+@pytest.mark.slow
 def test_a_source_goes_with_its_vehicle_and_is_counted_where_it_is():
     made = quiet(carried("rover1"))
     assert made.sources.position_m.shape == (2, 3)
@@ -161,6 +163,7 @@ def test_the_trail_of_a_carrier_is_read_by_time():
     assert poses_at(None, jnp.float32(0.0)) is None
 
 
+@pytest.mark.slow
 def test_the_spectrum_of_a_carried_source_is_drawn_where_it_was():
     made = carried("rover0")
     state = begin(made, jax.random.key(0))

@@ -91,6 +91,7 @@ def test_a_scan_equals_the_steps_one_by_one(fields, begun, commands, flown):
     assert_close(jax.jit(scanned)(fields[1], begun[1], commands), flown[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("in_kernels", [False, True], ids=["between branches", "inside them"])
 def test_commands_held_for_a_judging_period_are_those_of_each_period(
     fields, begun, commands, flown, in_kernels, monkeypatch
@@ -120,6 +121,7 @@ def test_commands_are_held_for_a_judging_period_at_most(fields, begun, commands)
             step(fields[0], begun[0], commands, periods)
 
 
+@pytest.mark.slow
 def test_a_batch_of_missions_at_different_ticks_equals_its_missions(fields, begun, commands, flown):
     batch = jax.jit(jax.vmap(scanned, in_axes=(0, 0, None)))(stacked(fields), stacked(begun), commands)
     for number, expected in enumerate(flown):
@@ -131,6 +133,7 @@ def test_a_batch_of_missions_at_different_ticks_equals_its_missions(fields, begu
     assert height[1] > height[0] > height[2]  # the lighter ones climb faster
 
 
+@pytest.mark.slow
 def test_a_batch_of_missions_that_share_their_clock_equals_its_missions(fields, begun, commands):
     shared = begun[1].clock
     begun = [replace(state, clock=shared) for state in begun]
@@ -158,6 +161,7 @@ def largest(jaxpr, count):
     return max(sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("in_kernels", [True, False])
 def test_a_batch_of_missions_copies_no_raster(monkeypatch, fields, begun, commands, in_kernels):
     """On a GPU. On a CPU the conditions stay, which copy what they read: the test would see it."""
