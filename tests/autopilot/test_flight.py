@@ -234,6 +234,7 @@ def test_a_takeover_while_it_holds_is_not_overruled(live):
     assert any("operator" in what for _, what in flight.log.events)
 
 
+@pytest.mark.slow
 def test_a_takeover_while_it_lands_ends_the_wait(live):
     link = FakeLink()
     link.sinks_m_s = 0.01

@@ -101,6 +101,7 @@ def test_what_the_watchdogs_see_while_it_plans_is_acted_on_at_once(twice, planni
     assert link.asked.count("land") == 1
 
 
+@pytest.mark.slow
 def test_a_hold_ends_while_it_still_plans(twice, planning):
     link = FakeLink()
     dogs = QUICK.watchdogs.model_copy(update={"planning_s": 1.0})

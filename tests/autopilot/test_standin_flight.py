@@ -81,6 +81,7 @@ def test_a_disarmed_vehicle_rests():
     assert np.array_equal(body.sensed.position_m, here)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["px4", "ardupilot"])
 def test_a_rover_of_a_mission_drives_to_a_point_along_a_velocity_and_home(kind):
     bench = Bench(kind, body=body_of("recon", "orpheus")).advance(6.0)

@@ -147,6 +147,7 @@ def test_a_source_of_another_nuclide_than_those_in_question_shows():
     assert float(excluded(loud, ALL)) == 0.0
 
 
+@pytest.mark.slow
 def test_where_as_many_sources_are_known_as_are_sought_no_further_one_is_noticed():
     state = _nothing(jnp.float32(BACKGROUND))[1]
     full = replace(state, sources=replace(state.sources, present=jnp.ones(1, bool)))

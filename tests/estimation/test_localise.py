@@ -186,6 +186,7 @@ def test_no_more_sources_are_found_than_there_is_room_for(localiser):
     assert float(estimated.misfit) > 5.0
 
 
+@pytest.mark.slow
 def test_an_earlier_state_leads_to_the_same_source_when_there_are_more_windows(localiser):
     m = drawn(AERIAL, mean_rois(SITE, DETECTORS, AERIAL, CO_60), 2)
     earlier = localiser(replace(m, valid=m.valid & (jnp.arange(360) < 220)))
@@ -259,6 +260,7 @@ def test_useless_data_give_a_finite_answer_that_is_no_detection(localiser, case)
     assert np.all(np.abs(np.asarray(fits.position_m)[:, :2]) <= 90.0)
 
 
+@pytest.mark.slow
 def test_a_source_that_the_others_explain_as_well_is_taken_away(localiser):
     """One of a thousandth that the search left 9 m beside the true one; of two true ones none."""
     beside, away = SOURCE + jnp.array([7.0, -6.0, 0.0]), SOURCE + jnp.array([-30.0, 5.0, 0.0])

@@ -61,6 +61,7 @@ def east(metres):
     return AT + np.array([metres, 0.0, 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("apart", "nuclides", "one"),
     [(2.0, (0, 0), True), (7.0, (0, 0), True), (20.0, (0, 0), False), (2.0, (0, 1), False)],
@@ -180,6 +181,7 @@ def test_a_step_of_both_leads_from_beside_two_sources_to_them(nuclides):
     assert np.ptp(changes[5:, 0, :2], axis=0).min() > 0.01
 
 
+@pytest.mark.slow
 def test_a_height_that_is_known_is_not_left_for_two_nuclides():
     known = replace(KNOWN, height_m=jnp.float32(1.0), height_std_m=jnp.float32(0.05))
     truth = [(AT, 150e6), (AT, 200e6, "Cs-137")]

@@ -107,6 +107,7 @@ def test_sampling_moves_a_source_that_the_search_left_beside_its_place(boxes):
     np.testing.assert_allclose(found.state.sources.activity_bq[0], ACTIVITY, rtol=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("boxes", "rate", "reach", "near", "usually"),
     [([], 1.0, 4.5, 0.2, 0.1), ([], 0.4, 7.2, 0.2, 0.1), (WALLS, 1.0, 1.7, 0.35, 0.2)],

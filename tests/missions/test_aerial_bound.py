@@ -109,6 +109,7 @@ def test_rmse_of_the_aerial_estimate_is_its_cramer_rao_bound(survey):
     assert np.mean(fits.converged) > 0.95
 
 
+@pytest.mark.slow
 def test_the_aerial_estimate_knows_its_error(survey):
     simulation, _, fits = survey
     world = simulation.world

@@ -132,6 +132,7 @@ def test_detection_limits_are_those_of_the_last_estimate(batch):
     assert np.isfinite(batch.conclusion.estimated.noticed_bq).all()
 
 
+@pytest.mark.slow
 def test_where_the_search_never_began_the_counts_are_still_looked_at(simulation, batch):
     """As of a mission that was over before; what its search would have learnt was never asked for."""
     phases = tuple(

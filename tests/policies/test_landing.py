@@ -249,6 +249,7 @@ def test_it_lands_on_a_rover_and_is_carried_to_the_end_of_its_way(flown, index):
     assert power.max() < 0.2 * np.diff(uav.energy_wh).max()  # its motors are off
 
 
+@pytest.mark.slow
 def test_without_the_rovers_broadcasts_it_stays_on_the_ground(flown):
     record = flown[1][3]
     uav = record.vehicles[1]

@@ -76,6 +76,7 @@ def test_every_shipped_nuclide_is_identified(library: Library, detectors: Detect
     np.testing.assert_allclose(np.sum(found.fit[:, above], axis=1), np.sum(counts[:, above], axis=1), rtol=0.02)
 
 
+@pytest.mark.slow
 def test_the_fit_in_channels_is_the_spectrum(library: Library, detectors: Detectors) -> None:
     """Without noise: in every channel about the peak within 3 % of the largest. Lines between bins were 8 % off."""
     detector = detectors["nai_2x2", "physical"]

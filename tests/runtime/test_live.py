@@ -71,6 +71,7 @@ def test_nothing_that_the_simulation_would_have_happen_to_it_happens(simulation)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(live.body()))
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_leaves_lets_the_mission_go_on(simulation):
     live = LiveMission(simulation, 3, "uav1")
     live.prepare()

@@ -46,6 +46,7 @@ def test_walls_and_doors_are_as_drawn(tmp_path, seed):
     assert inside == outside != 0, house.said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 7])
 def test_rays_meet_the_walls_that_the_mesh_has(tmp_path, seed):
     rng = np.random.default_rng(seed)

@@ -173,6 +173,7 @@ def test_uavs_that_fly_into_each_other_fall_apart(place):
     assert tracks[0].position_m[-1, :, 2].max() < 0.5
 
 
+@pytest.mark.slow
 def test_one_that_lies_on_another_comes_to_rest(place):
     """Dropped on one another with motors off: they neither spin up nor gain energy, and end beside each other."""
     made, start = place

@@ -78,6 +78,7 @@ def test_a_hard_drop_is_recorded_at_every_phase_of_the_judging_period(world, sta
     assert happened(state, 1) == [set()] * ROVERS
 
 
+@pytest.mark.slow
 def test_a_soft_landing_is_no_crash(world, start, rest):
     place = APART.copy()
     place[:, 2] = rest + np.linspace(0.02, 0.14, UAVS)

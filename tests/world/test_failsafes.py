@@ -67,6 +67,7 @@ def test_a_vehicle_that_flies_on_to_the_border_returns_and_lands_at_home(place, 
     assert not bool(state.groups[0].active[0])  # it has landed, and rests
 
 
+@pytest.mark.slow
 def test_the_ceiling_is_a_fence_too(place):
     made, start = place
     places = at(made, [0.0, -14.0, 20.0])

@@ -163,6 +163,7 @@ def fly():
     return jax.jit(flown)
 
 
+@pytest.mark.slow
 def test_teams_on_any_pads_take_off_cross_and_land_without_touching_or_waiting_for_ever():
     ways = jnp.stack([random_tour(seed) for seed in range(64)])
     result = jax.jit(jax.vmap(flown, (0, None)))(ways, speeds(5))

@@ -61,6 +61,7 @@ def test_what_falls_on_a_roof_rests_on_it(place):
     assert not any({"obstacle", "vehicle"} & kinds for kinds in happened(state))
 
 
+@pytest.mark.slow
 def test_a_roof_is_landed_on_and_left(place):
     made, start = place
     at = np.concatenate([spread(), np.full((COUNT, 1), 8.0)], -1)
