@@ -101,7 +101,7 @@ def find_sources(problem: Problem, places: Places, allowed: jax.Array, params: S
         p = replace(p, before=before, advanced=p.advanced | advance, advances=p.advances - advance)
         untried = done & ~p.trial & ~p.closing
         p = _ended_trial(params.further, p, done & p.trial)
-        p = _ended_advance(params, p, done & p.advanced)
+        p = _ended_advance(params.further, p, done & p.advanced)
         untried &= ~p.over & (jnp.sum(p.state.sources.present) >= 2)
         p = _begun_trial(problem, params, p, untried)
         full = (jnp.all(p.state.sources.present) | p.closing) & ~jnp.any(p.again)
@@ -230,10 +230,10 @@ def _ended_trial(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
     return replace(p, state=kept, trial=p.trial & ~now, divisions=_divisions(p, now & needless & gone))
 
 
-def _ended_advance(params: SearchParams, p: _Progress, now: jax.Array) -> _Progress:
-    """``now``: the sources with the further one if all explain enough; else those before, and no more."""
+def _ended_advance(least: jax.Array, p: _Progress, now: jax.Array) -> _Progress:
+    """``now``: the sources with the further one if all explain ``least`` [] more; else those before, and no more."""
     gain = 2.0 * (p.state.likelihood - p.before.likelihood)
-    short = now & (gain < params.further)
+    short = now & (gain < least)
     s = p.state.sources
     new = jnp.argmax(s.present & ~p.before.sources.present)
     before = replace(p.before, suspect=Suspect(ratio=gain, place=s.place[new], nuclide=s.nuclide[new]))

@@ -172,7 +172,7 @@ def drawn_of_one(site, detector, m, position, activity, seed):
 
 def spec(**changes):
     """Few places are tried: enough in the open, and fast."""
-    few = {"search_rounds": 5, "sample_rounds": 8, "samples": 32, "sources_max": 2}
+    few = {"search_rounds": 5, "sample_rounds": 20, "samples": 32, "sources_max": 2}
     given = {"presumed_height_m": 1.0, "height_std_m": 0.5, "window_s": 1.0}
     return Localisation(**(given | few | changes))
 

@@ -27,7 +27,6 @@ def _values(problem, state, places):
     return jax.lax.map(one, places)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("boxes", "std"), [([], 1.0), (WALLS, 0.5)])
 def test_places_have_the_posterior_that_all_windows_give_them(boxes, std):
     problem, state = told(boxes, 0)
