@@ -76,7 +76,11 @@ _FIRST = (
 _WAITING = "tests/autopilot/"
 
 # Files that share what takes long to make stay with one worker.
-_SHARING = {"tests/estimation/test_pairs.py": "tests/estimation/test_localise.py"}
+_SHARING = {
+    "tests/estimation/test_pairs.py": "tests/estimation/test_localise.py",
+    "tests/estimation/test_further_sources.py": "tests/estimation/test_localise.py",
+    "tests/estimation/test_focus.py": "tests/estimation/test_posterior.py",
+}
 
 _MAPS = 15_000  # the largest files take as many again
 _BYTES = 4e9  # that other processes leave: what JAX keeps within those maps is a gigabyte at most

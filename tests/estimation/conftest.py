@@ -12,7 +12,6 @@ from swarmsim.estimation.state import no_sources
 from tests.estimation.survey import NUCLIDES, counted, orbit, place, presumed, spec, spectrometer, survey
 
 DETECTORS = (spectrometer(), spectrometer("nai_2x2"))
-NOWHERE = [((-85.0, -85.0, 0.0), (0.01, 0.01, 0.01), "concrete")] * 2  # as many boxes as the walls of other tests
 FLIGHT, DRIVE = survey(count=300), orbit((12.0, 4.0), 7.0, 60)
 BOTH = concatenate(FLIGHT, DRIVE)
 AERIAL = replace(BOTH, valid=BOTH.detector == 0)
@@ -23,7 +22,7 @@ class Localiser:
     """`localise` with settings of the size that all tests share."""
 
     def __init__(self):
-        self.detectors, self.site = DETECTORS, place(NOWHERE)
+        self.detectors, self.site = DETECTORS, place()
         self.presumed = presumed(self.site, DETECTORS)
         self.params = localisation_params(spec())
         empty = counted(AERIAL, jnp.zeros((360, DETECTORS[0].background_rois.shape[0])))

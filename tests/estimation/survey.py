@@ -36,7 +36,9 @@ def place(boxes=(), slope=(0.0, 0.0), half=HALF, margin=20.0):
     """A plane of the given slope with solid boxes (centre, half extent, material); cells of 2 m."""
     side = np.arange(-half - margin, half + margin + 1e-9, 2.0)
     ground = slope[0] * side[None, :] + slope[1] * side[:, None]
-    boxes = boxes or [((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), "concrete")]
+    # a grain in a corner for each wall that it lacks of two: it is computed by the program of a place with these
+    grain = ((-half - 15.0, -half - 15.0, 0.0), (0.01, 0.01, 0.01), "concrete")
+    boxes = [*boxes, *[grain] * (2 - len(boxes))]
     centre, extent, material = zip(*boxes, strict=True)
     names = library().material_names
     raster = jnp.asarray(ground, jnp.float32)

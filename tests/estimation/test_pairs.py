@@ -15,10 +15,10 @@ from swarmsim.estimation.posterior import of_others
 from swarmsim.estimation.search import looked_at, screen_of
 from swarmsim.estimation.seek import as_known
 from swarmsim.estimation.state import no_sources, settled, signals, without
-from tests.estimation.conftest import BOTH, DETECTORS, NOWHERE, SPANS
+from tests.estimation.conftest import BOTH, DETECTORS, SPANS
 from tests.estimation.survey import ACTIVITY, NUCLIDES, SOURCE, drawn, mean_rois, place, presumed, spec
 
-SITE = place(NOWHERE)
+SITE = place()
 KNOWN, PARAMS = presumed(SITE, DETECTORS), localisation_params(spec())
 CERTAIN = replace(KNOWN, background_std=jnp.float32(0.01), model_std=jnp.float32(0.001), height_std_m=jnp.float32(0.05))
 AT = np.array([*SOURCE[:2], 1.0])

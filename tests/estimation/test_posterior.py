@@ -104,7 +104,6 @@ def integral(problem, state, reach):
     return mean, np.sqrt(variance)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("boxes", [[], WALLS])
 def test_sampling_moves_a_source_that_the_search_left_beside_its_place(boxes):
     problem, at_its_place = told(boxes, 0)

@@ -219,6 +219,7 @@ def test_what_was_drawn_is_flown_and_written(standing, tmp_path):
     assert len(summary["true_sources"]) == summary["drawn"]["sources.count"]
 
 
+@pytest.mark.slow
 def test_given_values_come_before_drawn_ones(standing):
     seeds = range(3, 3 + BATCH)
     draws = standing.draw(seeds)

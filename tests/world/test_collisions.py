@@ -187,6 +187,7 @@ def test_one_that_lies_on_another_comes_to_rest(place):
     assert np.linalg.norm(tracks[0].velocity_m_s[-1], axis=-1).max() < 0.2
 
 
+@pytest.mark.slow
 def test_rovers_that_meet_stop_outside_each_other(place):
     made, start = place
     rover = start.groups[1].vehicle

@@ -76,6 +76,7 @@ def test_the_ceiling_is_a_fence_too(place):
     assert tracks[0].position_m[:, 0, 2].max() < 30.2
 
 
+@pytest.mark.slow
 def test_a_low_battery_returns_above_everything_that_stands(place):
     made, start = place
     places = at(made, [36.0 - 20.0, 0.0, 3.0])

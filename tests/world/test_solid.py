@@ -78,6 +78,7 @@ def every(velocity):
     return jax.vmap(partial(fly_velocity, yaw_rad=0.0))(velocity)
 
 
+@pytest.mark.slow
 def test_walls_stop_whatever_flies_into_them(place):
     """Random headings, heights and speeds up to 12 m/s at the four sides of the house; the motors stop at the wall."""
     made, start = place
