@@ -27,7 +27,8 @@ from swarmsim.pytree import pytree
 NOTICED = 1.645  # standard deviations above what is asked of a source: it has that with 95 % (ISO 11929)
 MOST = 0.95  # of the places in the open, at which a source as strong as the limit would be noticed
 FASTEST = 10.0  # what a step may multiply the activity by
-STEPS = 6  # of the activity towards the limit, which is within 1 % then
+STEPS = 6  # of the activity towards the limit, at most; it is within 1 % then
+NEAR = 0.01  # step of its logarithm after which a further one would change next to nothing
 POWERS = (0.3, 1.2)  # of the activity, with which the root of the ratio may grow
 TOGETHER = 8  # nuclides that an accelerator looks at side by side
 
@@ -39,6 +40,7 @@ class _Tried:
     activity_bq: jax.Array  # []
     last_bq: jax.Array  # []
     last_root: jax.Array  # [] of the likelihood ratio that it has; 0: none was tried
+    steps: jax.Array  # [] int32, how many were tried
 
 
 def noticed(
@@ -107,17 +109,24 @@ def limits(problem: Problem, state: State, points_m: jax.Array, asked: jax.Array
         point, nuclide, root = one
         added, variance = open_counts(problem, point, nuclide), variance_of(problem, point)
 
-        def step(_: int, tried: _Tried) -> _Tried:
+        def on(tried: _Tried) -> jax.Array:
+            far = jnp.abs(jnp.log(tried.activity_bq / tried.last_bq)) > NEAR
+            return (tried.steps < STEPS) & (far | (tried.steps == 0))
+
+        def step(tried: _Tried) -> _Tried:
             now = jnp.sqrt(ratio(problem, state, tried.activity_bq * added, variance))
             grown = jnp.log(jnp.maximum(now, 1e-9) / jnp.maximum(tried.last_root, 1e-9))
             power = jnp.clip(grown / jnp.log(tried.activity_bq / tried.last_bq), *POWERS)
             power = jnp.where((tried.last_root > 0.0) & jnp.isfinite(power), power, 1.0)
             # a faint signal may be lost in rounding
             further = jnp.clip((reach / jnp.maximum(now, 1e-9)) ** (1.0 / power), 1.0 / FASTEST, FASTEST)
-            return _Tried(activity_bq=tried.activity_bq * further, last_bq=tried.activity_bq, last_root=now)
+            return _Tried(
+                activity_bq=tried.activity_bq * further, last_bq=tried.activity_bq, last_root=now, steps=tried.steps + 1
+            )
 
-        begin = _Tried(activity_bq=reach / root, last_bq=jnp.ones(()), last_root=jnp.zeros(()))
-        return jax.lax.fori_loop(0, STEPS, step, begin).activity_bq
+        zero = jnp.zeros(())
+        begin = _Tried(activity_bq=reach / root, last_bq=jnp.ones(()), last_root=zero, steps=jnp.int32(0))
+        return jax.lax.while_loop(on, step, begin).activity_bq
 
     return each(of, (points_m, jnp.arange(points_m.shape[0]), start), TOGETHER)
 

@@ -7,13 +7,14 @@ is a ridge: some of the places lie along it, and one is where a Gauss-Newton ste
 """
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import each
+from swarmsim.device import each, on_processor
 from swarmsim.estimation.fit import Settled, settle
-from swarmsim.estimation.forward import Problem, Rates, dead_time, rates, ways_from, with_one_ray
+from swarmsim.estimation.forward import Problem, Rates, Ways, dead_time, rates, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.normal_equations import (
     MEAN_FLOOR,
@@ -140,9 +141,9 @@ class _Seen:
     score: jax.Array  # []
 
 
-def _seen(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> _Seen:
-    lengths = jnp.zeros_like(problem.material_std)
-    net = rates(problem, ways_from(problem, place), nuclide, lengths, slopes=False).counts.T * screen.registered
+def _seen(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array, ways: Ways | None = None) -> _Seen:
+    lengths, ways = jnp.zeros_like(problem.material_std), ways_from(problem, place) if ways is None else ways
+    net = rates(problem, ways, nuclide, lengths, slopes=False).counts.T * screen.registered
     weighted = screen.weight * net
     own, inverse = _own(screen, nuclide, net)
     inside = jnp.sum(own * weighted, axis=1)
@@ -183,9 +184,14 @@ def _value(problem: Problem, seen: _Seen, place: jax.Array) -> jax.Array:
     return jnp.where(jnp.isfinite(value) & (seen.information > ROUNDING * seen.whole), value, -prior)
 
 
-def screened(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array) -> jax.Array:
-    """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted."""
-    return _value(problem, _seen(problem, screen, nuclide, place), place)
+def screened(
+    problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array, ways: Ways | None = None
+) -> jax.Array:  # fmt: skip
+    """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted.
+
+    ``ways`` are those from there, if they are known.
+    """
+    return _value(problem, _seen(problem, screen, nuclide, place, ways), place)
 
 
 def looked_at(
@@ -287,7 +293,7 @@ def best_of(
     low, high = bounds(problem)
     places, c = jnp.clip(candidates.place, low, high), candidates
     quick = with_one_ray(problem)
-    seen = each(lambda x: screened(quick, screen, x[1], x[0]), (places, c.nuclide), TOGETHER)
+    seen = _screened(quick, screen, c.nuclide, places, c.allowed | c.sure)
     rank = jnp.where(c.sure, jnp.inf, jnp.where(c.allowed, seen, -jnp.inf))
     parts = rank.reshape(FITTED, -1)
     of_parts = jnp.argmax(parts, axis=1) + jnp.arange(FITTED) * parts.shape[1]
@@ -302,6 +308,31 @@ def best_of(
     values = jnp.where(c.allowed, unfitted, -jnp.inf).at[chosen].set(value)
     better = value[first] > best.fit.value
     return jax.tree.map(lambda a, b: jnp.where(better, a[first], b), tried, best), values
+
+
+def _screened(
+    problem: Problem, screen: Screen, nuclide: jax.Array, places: jax.Array, asked: jax.Array
+) -> jax.Array:  # fmt: skip
+    """What `screened` finds at each of ``places`` [C, 3] with its ``nuclide`` [C]; of those not ``asked`` [C] anything.
+
+    Nuclides are compared at one place: a processor, which takes one after another, follows the ways from there once.
+    """
+    if not on_processor():
+        return each(lambda x: screened(problem, screen, x[1], x[0]), (places, nuclide), TOGETHER)
+    alike, first = jnp.all(places == places[0]), partial(ways_from, problem, places[0])
+    unseen = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(first))
+    known = jax.lax.cond(alike, first, lambda: unseen)
+
+    def one(x: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        place, nuclide, asked = x
+
+        def look() -> jax.Array:
+            ways = jax.lax.cond(alike, lambda: known, lambda: ways_from(problem, place))
+            return screened(problem, screen, nuclide, place, ways)
+
+        return jax.lax.cond(asked, look, lambda: jnp.zeros(()))
+
+    return each(one, (places, nuclide, asked), TOGETHER)
 
 
 def bounds(problem: Problem) -> Bounds:

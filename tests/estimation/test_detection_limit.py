@@ -10,7 +10,8 @@ import pytest
 from scipy.stats import norm
 
 from swarmsim.device import some_at_a_time
-from swarmsim.estimation.detection_limit import MOST, limits, noticed
+from swarmsim.estimation.detection_limit import MOST, limits, noticed, ratio
+from swarmsim.estimation.forward import variance_of
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.overload import overloaded
 from swarmsim.estimation.scan import open_counts, open_totals, scan
@@ -82,6 +83,22 @@ def test_a_source_at_its_detection_limit_is_noticed_nineteen_times_of_twenty(at,
     added = jnp.float32(rng.poisson(np.maximum(activity[:, None, None] * per_bq, 0.0)))
     ratio = np.asarray(ratios_of(drawn + added, point))
     assert 0.87 < np.mean(ratio > ASKED) < 0.995
+
+
+def test_a_source_at_its_limit_has_the_ratio_that_is_asked_and_its_chance():
+    @jax.jit
+    def reached(rois):
+        problem, state = _nothing(rois)
+        point = jnp.array([10.0, 4.0, 1.0])
+
+        def of(activity, nuclide):
+            signal = activity * open_counts(problem, point, nuclide)
+            return ratio(problem, state, signal, variance_of(problem, point))
+
+        return jax.vmap(of)(_limits(problem, state, point), jnp.arange(len(NUCLIDES)))
+
+    root = np.sqrt(np.asarray(reached(BACKGROUND)))
+    np.testing.assert_allclose(root, np.sqrt(float(ASKED)) + norm.ppf(0.95), rtol=5e-3)
 
 
 def test_most_places_reach_the_limit_that_is_told():

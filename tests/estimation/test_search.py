@@ -10,9 +10,10 @@ import pytest
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import ways_from
+from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
-from swarmsim.estimation.search import Screen, Tried, _own, attempt, spread_along
+from swarmsim.estimation.search import Screen, Tried, _own, _screened, attempt, screen_of, screened, spread_along
 from swarmsim.estimation.seek import least_of
 from swarmsim.estimation.seek import sought as seek
 from swarmsim.estimation.state import no_sources, settled, signals
@@ -139,6 +140,26 @@ def test_a_window_s_gain_has_the_spectrum_of_the_nuclide_that_is_asked_for():
     np.testing.assert_allclose(
         mine[1], (source[::-1] * source.sum(0) / source[::-1].sum(0) + others) * registered, rtol=1e-5
     )
+
+
+@jax.jit
+def _together_and_alone(known, m, places, nuclides, asked):
+    problem, at = problem_of(known, m, SPANS), jnp.float32(AT)
+    nothing = no_sources(problem, 1, len(NUCLIDES))
+    fit = attempt(problem, CO_60, nothing.added, nothing.unknowns, at).fit
+    where = position_of(problem.site, at)
+    screen = screen_of(problem, nothing.added, fit.rates, CO_60, where, fit.unknowns)
+    alone = jax.lax.map(lambda x: screened(problem, screen, *x), (nuclides, places))
+    return _screened(problem, screen, nuclides, places, asked), alone
+
+
+def test_candidates_have_what_each_has_alone_whether_or_not_they_are_at_one_place():
+    known, m = told(WALLS)
+    nuclides, asked = jnp.arange(len(NUCLIDES)), np.arange(len(NUCLIDES)) != 2
+    for off in (np.zeros((len(NUCLIDES), 3)), np.random.default_rng(0).normal(size=(len(NUCLIDES), 3))):
+        together, alone = _together_and_alone(known, m, jnp.float32(AT + 0.3 + off), nuclides, jnp.asarray(asked))
+        np.testing.assert_allclose(together[asked], alone[asked], rtol=1e-5)
+        assert np.ptp(np.asarray(alone)) > 10.0
 
 
 def test_a_further_source_must_explain_more_than_the_first():
