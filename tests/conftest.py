@@ -58,7 +58,6 @@ _FIRST = (
     "autopilot/test_fly.py",
     "autopilot/test_manual_flight.py",
     "estimation/test_localise.py",
-    "test_readme.py",
     "estimation/test_posterior.py",
     "missions/test_aerial_bound.py",
     "families/test_families.py",
@@ -70,6 +69,7 @@ _FIRST = (
     "radiation/test_identify.py",
     "world/test_collisions.py",
     "world/test_transforms.py",
+    "test_readme.py",
 )
 
 # Flights in real time, which wait most of the time: one worker more than there are cores does so beside the others.

@@ -64,6 +64,7 @@ def test_a_few_steps_come_as_far_as_many_wherever_the_source_is_sought():
     assert short.max() < 0.75
 
 
+@pytest.mark.slow
 def test_a_step_of_the_place_leads_to_a_source_in_the_open():
     known, m = told([])
     rng = np.random.default_rng(1)

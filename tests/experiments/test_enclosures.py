@@ -51,6 +51,7 @@ def test_a_very_wide_box_is_a_slab(library: Library, name: str, metres: float, e
     agrees(around(wide, (tables,), energy, (7.0, 0.0, 0.0)), expected)
 
 
+@pytest.mark.slow
 def test_a_shell_is_the_shell(library: Library) -> None:
     """By next events at one point; the other counts the photons that leave."""
     tables = medium(library.material("concrete"), 662.0)
@@ -67,6 +68,7 @@ def _attenuation(tables: Medium, energy: float) -> jax.Array:
     )
 
 
+@pytest.mark.slow
 def test_a_wall_in_two_pieces_of_two_media_is_one(library: Library) -> None:
     """The order of the pieces does not matter, nor which of the media of one material they are of."""
     tables = medium(library.material("concrete"), 662.0)
@@ -87,6 +89,7 @@ def test_matter_behind_the_detector_does_not_shield_it(library: Library) -> None
     assert float(found.uncollided[1]) == 0.0
 
 
+@pytest.mark.slow
 def test_walls_of_a_house_scatter_less_than_a_wide_slab(library: Library) -> None:
     """Seen from 30 m the walls around a source are small: a third of what a slab of their thickness scatters there."""
     tables = medium(library.material("concrete"), 662.0)

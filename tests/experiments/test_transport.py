@@ -64,6 +64,7 @@ def test_no_photon_is_made_by_a_shell_of_low_absorption(library: Library) -> Non
     assert 0.9 < total < 1.0
 
 
+@pytest.mark.slow
 def test_a_spherical_shell_scatters_less_towards_the_detector_than_a_slab(library: Library) -> None:
     """A wide slab sends photons from its whole area; a shell around the source only what leaves it outwards."""
     concrete = library.material("concrete")

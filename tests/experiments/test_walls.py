@@ -81,6 +81,7 @@ def test_counts_of_houses_and_sheds(detector: Detector, kind: str, within_10: fl
     assert np.mean(apart < 0.25) >= within_25
 
 
+@pytest.mark.slow
 def test_the_ground_adds_what_it_scatters(library: Library, detector: Detector) -> None:
     """A source 1 m above soil: with its photons the counts are within 4 % of the Monte Carlo's, or 8 % close to it."""
     places = views()
