@@ -274,7 +274,8 @@ def _contradiction(first: Sequence[Estimate], last: Sequence[Estimate]) -> str:
     """What sources by the survey and by all counts do not agree in; nothing if they do."""
     distance, sigmas = _off(first, last, MODEL_STD_M)
     if sigmas > APART_SIGMA:
-        return f"the {last[0].nuclide} source by the survey and by all counts lies {distance:.0f} m apart"
+        where = f"the survey alone had the {last[0].nuclide} source {distance:.0f} m from where all counts have it"
+        return f"{where} (it may have taken several for one)"
     if first[0].nuclide != last[0].nuclide:
         return ""
     totals = [sum(max(one.activity_mbq, 1e-9) for one in group) for group in (first, last)]

@@ -98,7 +98,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "noticed_mbq": {name: value if np.isfinite(value) else None for name, value in record.noticed_mbq.items()},
         "nuclide": {
             "name": named(record),
-            "confidence": None if spectrum is None else float(spectrum.confidence),
+            "confidence": None if spectrum is None or named(record) is None else float(spectrum.confidence),
             "of_source": record.examined,
         },
         "dose_rate": dose_summary(record),

@@ -15,7 +15,7 @@ def check_extent(sides_m: tuple[float, float], relief_m: float, path: Path) -> N
         raise InputError.of(
             f"the site would be {sides_m[0]:.4g} m by {sides_m[1]:.4g} m, and {relief_m:.4g} m high: a simulation in "
             "single precision does not place a vehicle to a centimetre there", file=path, path="unit_m",
-            allowed=f"sides of at most {EXTENT_MAX_M:g} m, heights over {RELIEF_MAX_M:g} m",
+            allowed=f"sides of at most {EXTENT_MAX_M:g} m, a height of at most {RELIEF_MAX_M:g} m",
             suggestion="set unit_m (--unit) if the unit is wrong, or cut out a smaller piece",
         )  # fmt: skip
 
