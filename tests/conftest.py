@@ -93,7 +93,7 @@ settings.load_profile("deterministic")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Choose between those that are done in minutes and all."""
-    parser.addoption("--slow", action="store_true", help="run the tests that take 20 s and more as well")
+    parser.addoption("--slow", action="store_true", help="run the tests that take long as well")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -10,6 +10,7 @@ from swarmsim.families.draw import columns
 from swarmsim.results.record import Estimate, MissionRecord
 from swarmsim.results.summary import (
     Timings,
+    confidence_of_name,
     dose_summary,
     energy_wh,
     estimate_summary,
@@ -54,7 +55,7 @@ def batch_row(record: MissionRecord) -> dict[str, Any]:
     limits = [value if np.isfinite(value) else None for value in sorted(record.noticed_mbq.values())]
     row |= {"noticed_least_mbq": next(iter(limits), None), "noticed_most_mbq": next(reversed(limits), None)}
     row["nuclide"] = named(record)
-    row["nuclide_confidence"] = None if record.spectrum is None else float(record.spectrum.confidence)
+    row["nuclide_confidence"] = confidence_of_name(record)
     dose = dose_summary(record)
     row["dose_rate_greatest_usv_h"] = None if dose is None else dose["greatest_usv_h"]
     row["crashed"] = sum(bool(v.crashed) for v in record.vehicles)

@@ -77,7 +77,6 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
     """
     record = record.finite()
     hotspot = hotspot_of(record.map)
-    spectrum = record.spectrum
     return {
         "name": record.name,
         "site": record.site,
@@ -98,7 +97,7 @@ def summary(record: MissionRecord, timings: Timings) -> dict[str, Any]:
         "noticed_mbq": {name: value if np.isfinite(value) else None for name, value in record.noticed_mbq.items()},
         "nuclide": {
             "name": named(record),
-            "confidence": None if spectrum is None or named(record) is None else float(spectrum.confidence),
+            "confidence": confidence_of_name(record),
             "of_source": record.examined,
         },
         "dose_rate": dose_summary(record),
@@ -309,6 +308,11 @@ def named(record: MissionRecord) -> str | None:
     if spectrum is None or record.examined is None or not spectrum.sure:
         return None
     return None if spectrum.nuclide in ("none", "unknown") else spectrum.nuclide
+
+
+def confidence_of_name(record: MissionRecord) -> float | None:
+    """Probability of the nuclide that the spectrum names; None where it names none."""
+    return None if record.spectrum is None or named(record) is None else float(record.spectrum.confidence)
 
 
 def plain(values: NDArray[np.floating]) -> list[float]:

@@ -195,6 +195,15 @@ def test_activity_error_is_a_size_whatever_its_sign(found: MissionRecord) -> Non
     assert summary(high, TIMINGS)["source"]["activity_error_percent"] == pytest.approx(10.0)
 
 
+def test_where_no_nuclide_is_named_there_is_no_confidence(found: MissionRecord) -> None:
+    """A spectrum that was taken near none of the sources, though it is one's beyond doubt."""
+    apart = dataclasses.replace(found, examined=None)
+    assert summary(apart, TIMINGS)["nuclide"] == {"name": None, "confidence": None, "of_source": None}
+    for record, expected in ((found, ("Co-60", 0.9997)), (apart, (None, None))):
+        row = batch_row(record)
+        assert (row["nuclide"], row["nuclide_confidence"]) == expected
+
+
 def test_of_several_sources_the_nearest_counts(found: MissionRecord) -> None:
     far = TrueSource("Cs-137", np.array([-40.0, -30.0, 1.0]), 5.0)
     several = dataclasses.replace(found, sources=(far, *found.sources))
