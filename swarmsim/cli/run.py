@@ -185,6 +185,11 @@ def summary_table(summary: dict[str, Any], name: str) -> Table:
     for rows in (_FOUND_ROWS, _TIME_ROWS):
         table.add_section()
         _add_rows(table, summary, rows)
+        if rows is _FOUND_ROWS and summary.get("source") and summary.get("noticed_mbq"):
+            from swarmsim.results.finding import noticed_from
+
+            limits = noticed_from(summary["noticed_mbq"])
+            table.add_row("Others, in free view", f"noticed from {limits}" if limits else "not noticed", "")
     table.add_section()
     _add_vehicles(table, summary["vehicles"])
     events = [event for event in summary["events"] if event["kind"] != "finished"]

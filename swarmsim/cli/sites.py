@@ -1,6 +1,7 @@
 """What ``swarmsim import-site`` does."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from swarmsim.cli.run import value_text
 from swarmsim.config.allowed import shape_of
 from swarmsim.config.base import Name
 from swarmsim.config.documents import Document
-from swarmsim.config.errors import InputError
+from swarmsim.config.errors import InputError, Problem
 from swarmsim.config.overrides import apply_overrides
 from swarmsim.config.site import SiteSpec
 from swarmsim.site.source_files import TIFF_SUFFIXES
@@ -21,6 +22,10 @@ from swarmsim.site.source_files import TIFF_SUFFIXES
 WIDTH = 120  # of what is printed where there is no terminal
 OPTIONS = {"name": "the folder's name (--out)", "licence": "--licence", "cell_m": "--cell"}
 """Fields of a site that have an option of their own, other than those in `import_site_file`'s ``given``."""
+GIVEN_BY = {
+    "unit_m": "--unit", "height_unit_m": "--height-unit", "up_axis": "--up", "ground": "--ground", "plane": "--plane"
+}  # fmt: skip
+"""The options of these."""
 
 
 def import_site_file(
@@ -62,7 +67,10 @@ def import_site_file(
         cell_m=cell_m, fields=document.data, overwrite=force, licence=licence or ImportOptions.licence,
         guess=guess,
     )  # fmt: skip
-    model = import_site(file, out, options)
+    try:
+        model = import_site(file, out, options)
+    except InputError as error:
+        raise InputError([_by_option(problem, out, given) for problem in error.problems]) from error
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH)
@@ -75,6 +83,15 @@ def import_site_file(
     console.print(f"Site: {out}", markup=False, highlight=False, soft_wrap=True)
     if options.preview:
         console.print(f"Preview: {out / 'preview.png'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _by_option(problem: Problem, out: Path, given: Mapping[str, Any]) -> Problem:
+    """What is wrong with the specification that was to be written, told of the option that asked for it."""
+    if problem.file != str(out / "site.yaml") or problem.path is None:
+        return problem
+    field = problem.path.split(".")[0]
+    option = GIVEN_BY[field] if given.get(field) is not None else OPTIONS.get(field, "--set")
+    return replace(problem, file="--set") if option == "--set" else replace(problem, file=None, path=option)
 
 
 def _check_name(out: Path) -> None:

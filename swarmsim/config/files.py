@@ -1,6 +1,7 @@
 """Where configuration files are: the working folder's ``configs`` first, then those that the package carries."""
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from swarmsim.config.errors import InputError
@@ -64,6 +65,21 @@ def exists(path: Path) -> bool:
         return False
 
 
+def _meant(name: str, path: Path, beside: Iterable[str], known: Iterable[str]) -> str | None:
+    """A hint to what is meant by a ``name`` that names nothing: a file ``beside`` it, or one of the ``known`` names."""
+    if looks_like_path(name):
+        return did_you_mean(name, beside)
+    return f"if the file is meant, write './{name}'" if is_file(path) else did_you_mean(name, known)
+
+
+def _is_link(path: Path) -> bool:
+    """Whether ``path`` is a symbolic link, to whatever."""
+    try:
+        return path.is_symlink()
+    except OSError:
+        return False
+
+
 def is_file(path: Path) -> bool:
     """Whether ``path`` is a regular file; not where no file could have that name."""
     return exists(path) and path.is_file()
@@ -99,10 +115,18 @@ def find(kind: str, name: str | Path, near: Path | None = None) -> Path:
     known = available(kind, near)
     if str(name) in known:
         return known[str(name)]
-    beside = sorted(str(path.parent / p.name) for p in listing(path.parent, "*") if p.suffix in _SUFFIXES)
+    beside = sorted(
+        str(path.parent / p.name) for p in listing(path.parent, "*") if p.suffix in _SUFFIXES and is_file(p)
+    )
+    if _is_link(path):
+        raise InputError.of(
+            f"'{name}' is a link to nothing", given=str(name), suggestion="mend the link, or name a file"
+        )
+    if kind != "sites" and exists(path) and not is_file(path):
+        raise InputError.of(f"'{name}' is a folder, not a file", given=str(name), suggestion="name the YAML file in it")
     raise InputError.of(
         f"there is no {'file' if looks_like_path(str(name)) else kind.removesuffix('s')} '{name}'",
         given=str(name),
         allowed=f"{one_of(known)}; or the path of a file",
-        suggestion=did_you_mean(str(name), beside) if looks_like_path(str(name)) else did_you_mean(str(name), known),
+        suggestion=_meant(str(name), path, beside, known),
     )

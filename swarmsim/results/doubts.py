@@ -29,7 +29,12 @@ IMPLAUSIBLE_SIGMA = 3.0  # between the activity of a source and what is presumed
 
 def in_mbq(activity_mbq: float) -> str:
     """An activity in words, with two digits at least: that of a faint source is not zero."""
-    return f"{activity_mbq:.0f} MBq" if activity_mbq >= 10.0 else f"{activity_mbq:.2g} MBq"
+    if activity_mbq < 10.0:
+        return f"{activity_mbq:.2g} MBq"
+    for unit, size in (("PBq", 1e9), ("TBq", 1e6), ("GBq", 1e3)):
+        if activity_mbq >= 10.0 * size:
+            return f"{activity_mbq / size:.0f} {unit}"
+    return f"{activity_mbq:.0f} MBq"
 
 
 def companions(

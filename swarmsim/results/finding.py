@@ -65,14 +65,25 @@ def _noticed(noticed_mbq: Mapping[str, float]) -> str:
     """How strong a source would have had to be: "none" says little without."""
     if not noticed_mbq:
         return ""
-    limits = sorted((value, name) for name, value in noticed_mbq.items() if math.isfinite(value))
-    if not limits:
+    from_ = noticed_from(noticed_mbq)
+    if from_ is None:
         return f" (nor would one of any activity in free view have been noticed, over {MOST:.0%} of the survey area)"
+    return f" (in free view, over {MOST:.0%} of the survey area, one would have been noticed from {from_})"
+
+
+def noticed_from(noticed_mbq: Mapping[str, float | None]) -> str | None:
+    """From which activities on nuclides are noticed, of the first and of the last one; None where none is.
+
+    ``noticed_mbq`` has infinity or None for one that never is.
+    """
+    limits = sorted((value, name) for name, value in noticed_mbq.items() if value is not None and math.isfinite(value))
+    if not limits:
+        return None
     told = [f"{in_mbq(value)} {name}" for value, name in (limits[0], limits[-1])]
     from_ = told[0] if len(limits) == 1 else f"{told[0]} to {told[1]}"
     never = sorted(set(noticed_mbq) - {name for _, name in limits})
     but = f", but none of {' or '.join(never[:3])}{' and others' if len(never) > 3 else ''}" if never else ""
-    return f" (in free view, over {MOST:.0%} of the survey area, one would have been noticed from {from_} on{but})"
+    return f"{from_} on{but}"
 
 
 def _placed(estimate: Estimate) -> str:

@@ -231,6 +231,10 @@ def import_site(
 
 
 def _check_out(out: Path, overwrite: bool) -> None:
+    parent = next(p for p in out.absolute().parents if p.exists())
+    if not parent.is_dir():
+        message = f"the site cannot be written there: '{parent}' is no folder"
+        raise InputError.of(message, file=out, suggestion="choose another folder")
     if out.exists() and not overwrite:
         raise InputError.of("there is something already", file=out, suggestion="choose another folder, or overwrite it")
     if out.exists() and not (out / "site.yaml").is_file():

@@ -41,6 +41,7 @@ SUMMARY: dict[str, Any] = {
         "activity_std_mbq": 3.47,
         "activity_error_percent": 0.7,
     },
+    "noticed_mbq": {"Co-60": 4.14, "Cs-137": 12.3, "Am-241": None},
     "nuclide": {"name": "Co-60", "confidence": 0.999},
     "real_time_factor": 55.5,
     "timing": {"compile_s": 20.0, "run_s": 10.0, "write_s": 0.5},
@@ -173,6 +174,7 @@ def test_run_flies_the_mission_and_prints_the_summary(
         "collided with a vehicle, 42",
         "vehicle: collided with another vehicle",
         "swarmsim view runs/recon",
+        "4.1 MBq Co-60",
     ):
         assert fragment in printed.out
     assert "three UAVs landed" in printed.err

@@ -216,6 +216,17 @@ def test_import_site_under_a_name_or_with_a_unit_that_cannot_be(
     assert "--out: is the folder of no name that a site can have" in capsys.readouterr().err
     assert cli.main(["import-site", "yard.obj", "--out", "configs/sites/yard", "--height-unit", "2"]) == 2
     assert "--height-unit: is of elevation models only" in capsys.readouterr().err
+    assert cli.main(["import-site", "yard.obj", "--out", "yard.obj/site"]) == 2
+    assert "yard.obj' is no folder" in " ".join(capsys.readouterr().err.split())
+    wrong = {
+        "--cell": ["--cell", "1e-9"], "--unit": ["--unit", "1e30"], "--set unit_m": ["--set", "unit_m=1e30"],
+        "--set holes_max": ["--set", "holes_max=7"],
+    }  # fmt: skip
+    for where, options in wrong.items():
+        assert cli.main(["import-site", "yard.obj", "--out", "configs/sites/yard", *options]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"{where}: is too ")
+        assert "site.yaml" not in said
     assert everything(project) == before
 
 
@@ -292,5 +303,5 @@ def test_cells_of_next_to_nothing_are_refused(
     mesh = packaged_dir() / "sites" / "works_yard" / "works_yard.dae"
     monkeypatch.chdir(tmp_path)
     assert cli.main(["import-site", str(mesh), "--out", "o", "--cell", "1e-308"]) == 2
-    assert "cell_m" in capsys.readouterr().err
+    assert "--cell: is too small" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -77,7 +77,7 @@ def test_what_is_no_file(mission: Path, capsys: pytest.CaptureFixture[str]) -> N
     mission.with_name("circle.yaml").symlink_to("circle.yaml")
     assert "not a regular file" in check(mission.with_name("pipe.yaml"), capsys)
     assert "not a regular file" in check(mission.with_name("device.yaml"), capsys)
-    assert "there is no file" in check(mission.with_name("circle.yaml"), capsys)
+    assert "is a link to nothing" in check(mission.with_name("circle.yaml"), capsys)
     assert "there is no file" in check("x" * 300 + ".yaml", capsys)
     assert "not a regular file" in check("/dev/zero", capsys)
     mission.with_name("ext.yaml").write_text("extends: pipe\n")
@@ -88,3 +88,23 @@ def test_a_long_chain_of_files(mission: Path, capsys: pytest.CaptureFixture[str]
     for i in range(40):
         mission.with_name(f"m{i}.yaml").write_text(f"extends: m{i + 1}\n")
     assert "too long a chain" in check(mission.with_name("m0.yaml"), capsys)
+
+
+def test_what_stands_where_a_mission_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a_folder").mkdir()
+    (tmp_path / "a_file").touch()
+    (tmp_path / "dangling.yaml").symlink_to("nowhere.yaml")
+    told = {
+        "a_folder": "'a_folder' is a folder, not a file",
+        "a_file": "if the file is meant, write './a_file'",
+        "dangling.yaml": "'dangling.yaml' is a link to nothing",
+        "dangling.yml": "there is no file 'dangling.yml'",
+    }
+    for name, sentence in told.items():
+        assert main(["run", name]) == 2
+        said = " ".join(capsys.readouterr().err.split())
+        assert sentence in said
+        assert "did you mean" not in said

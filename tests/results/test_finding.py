@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from swarmsim.results.doubts import in_mbq
 from swarmsim.results.finding import NO_WAY, NOTHING_FOUND, NOTHING_SOUGHT, finding
 from swarmsim.results.record import Spectrum
 from swarmsim.results.status import Verdict
@@ -164,3 +165,12 @@ def test_the_source_that_a_spectrum_was_taken_near_is_the_one_that_it_names():
     first, second = said.split("; of ")
     assert "identified" not in first
     assert second.endswith("; identified with 97.0%")
+
+
+@pytest.mark.parametrize(
+    ("mbq", "told"),
+    [(0.0123, "0.012 MBq"), (9.94, "9.9 MBq"), (170.4, "170 MBq"), (9_999.0, "9999 MBq"), (150_000.0, "150 GBq"),
+     (12_341_720.0, "12 TBq"), (3e10, "30 PBq")],
+)  # fmt: skip
+def test_activities_are_told_in_units_of_their_size(mbq: float, told: str) -> None:
+    assert in_mbq(mbq) == told

@@ -85,7 +85,7 @@ def test_different_nuclides_are_compared_by_what_they_add() -> None:
     at_1_m = {"Co-60": GammaConstant(0.35, 0.30), "Pu-239": GammaConstant(1e-6, 1e-6)}
     pair = (estimate(activity=222.0), estimate(7.8, activity=1.5e5, nuclide="Pu-239"))
     said = " ".join(verdict(final=pair, at_1_m=at_1_m, presumed=(222.0, 10.0)).reasons)
-    assert "the Pu-239 source of 150000 MBq 7.8 m beside one of a higher dose rate" in said
+    assert "the Pu-239 source of 150 GBq 7.8 m beside one of a higher dose rate" in said
     assert "the Co-60 source" not in said
     # of two that add as much neither is faint
     even = {"Co-60": GammaConstant(0.35, 0.30), "Am-241": GammaConstant(0.003, 0.0025)}
