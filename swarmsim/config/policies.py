@@ -70,7 +70,10 @@ class ParallelLines(_Flown):
 
 
 class ApproachAndOrbit(_Targeted):
-    """Drive the cheapest way to a target, then visit ``viewpoints`` round it at ``standoff_m``, ``laps`` times."""
+    """Drive the cheapest way to a target, then visit ``viewpoints`` round it at ``standoff_m``, ``laps`` times.
+
+    The ways there and between viewpoints may pass nearer: nothing keeps a vehicle away from a source.
+    """
 
     vehicles: ClassVar[tuple[str, ...]] = ("skid_steer",)
 
