@@ -126,8 +126,17 @@ def _lock(file: BinaryIO) -> bool:
     return True
 
 
+def folder_above(target: Path) -> Path:
+    """The nearest folder above ``target`` that exists; raises `NotADirectoryError` where a file stands there."""
+    parent = next(parent for parent in target.absolute().parents if parent.exists())
+    if not parent.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, f"'{parent}' is no folder")
+    return parent
+
+
 def _create_parents(target: Path) -> list[Path]:
     """Create the missing parents of ``target``; those created, innermost first."""
+    folder_above(target)
     missing = [parent for parent in target.parents if not parent.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     return missing

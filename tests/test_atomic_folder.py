@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from swarmsim.atomic_folder import atomic_folder
+from swarmsim.atomic_folder import atomic_folder, folder_above
 
 
 def anything(target: Path) -> None:
@@ -96,3 +96,15 @@ def test_a_parent_that_others_wrote_into_stays(tmp_path: Path) -> None:
     with pytest.raises(InterruptedError):
         interrupted_write(tmp_path / "a" / "run", tmp_path / "a" / "theirs")
     assert content(tmp_path) == {"a/theirs": "theirs"}
+
+
+def test_a_file_where_a_folder_above_is_to_be_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("kept")
+    assert folder_above(tmp_path / "a" / "b" / "c") == tmp_path
+    with (
+        pytest.raises(NotADirectoryError, match="file' is no folder"),
+        atomic_folder(tmp_path / "file" / "a", anything),
+    ):
+        raise AssertionError
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert (tmp_path / "file").read_text() == "kept"

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
+from swarmsim.atomic_folder import folder_above
 from swarmsim.config.errors import InputError, file_errors_told
 from swarmsim.results import names
 
@@ -121,14 +122,11 @@ def keep_elsewhere(write: Callable[[Path], int], whole: int, name: str) -> Path 
 
 def told_of(out: Path) -> AbstractContextManager[None]:
     """Turn errors of the file system, such as a full disk, into an `InputError` about ``out``."""
-    return file_errors_told("the results cannot be written there", path="--out", given=str(out))
+    hint = "choose another folder with --out"
+    return file_errors_told("the results cannot be written there", path="--out", given=str(out), suggestion=hint)
 
 
 def _check(out: Path, force: bool) -> None:
     check_folder(out, force, RUN)
-    parent = next(p for p in out.absolute().parents if p.exists())
-    if not parent.is_dir():
-        message = f"the results cannot be written there: '{parent}' is no folder"
-        raise InputError.of(message, path="--out", given=str(out), suggestion="choose another folder with --out")
-    with tempfile.TemporaryDirectory(prefix=".", dir=parent):
+    with tempfile.TemporaryDirectory(prefix=".", dir=folder_above(out)):
         pass  # permissions do not tell everything: a folder may lie in a file system that takes no files

@@ -216,7 +216,7 @@ def import_site(
         source, largest if isinstance(largest, float | int) else MAX_FILE_MB
     )  # the specification checks the rest
     data = _specification(source, out, options)
-    told = file_errors_told("the site cannot be written there", file=out)
+    told = file_errors_told("the site cannot be written there", file=out, suggestion="choose another folder")
     with told, atomic_folder(out, partial(_check_out, overwrite=options.overwrite)) as folder:
         try:
             model, found = _make(folder, source, data, material_names, options.guess)
@@ -231,10 +231,6 @@ def import_site(
 
 
 def _check_out(out: Path, overwrite: bool) -> None:
-    parent = next(p for p in out.absolute().parents if p.exists())
-    if not parent.is_dir():
-        message = f"the site cannot be written there: '{parent}' is no folder"
-        raise InputError.of(message, file=out, suggestion="choose another folder")
     if out.exists() and not overwrite:
         raise InputError.of("there is something already", file=out, suggestion="choose another folder, or overwrite it")
     if out.exists() and not (out / "site.yaml").is_file():
