@@ -90,15 +90,16 @@ def left_out(instrument: Instrument, per_nuclide: int, rng: np.random.Generator)
     """Rows of the table for nuclides that the library lacks."""
     rows = []
     for k, name in enumerate(instrument.detector.nuclide_names):
-        nets = np.repeat(NET, per_nuclide)
-        cases = instrument.draw(rng, np.full(len(nets), k), nets, DEPTH_MAX)
-        found = identified(without(instrument.detector, k), cases)
-        for net in NET:
-            part = jax.tree.map(lambda leaf, of=nets == net: leaf[of], found)
-            # names of the other nuclides move up, so that none of them is the one left out: all are wrong
-            values = figures(cases.nuclide[nets == net], part, np.asarray(part.nuclide) == UNKNOWN)
-            rows.append({"case": "left out", "net": net, "depth_max": DEPTH_MAX, "nuclide": name} | values)
-    return sorted(rows, key=lambda row: row["net"])
+        nets, lacking = np.repeat(NET, per_nuclide), without(instrument.detector, k)
+        for depth_max in (0.0, DEPTH_MAX):
+            cases = instrument.draw(rng, np.full(len(nets), k), nets, depth_max)
+            found = identified(lacking, cases)
+            for net in NET:
+                part = jax.tree.map(lambda leaf, of=nets == net: leaf[of], found)
+                # names of the other nuclides move up, so that none of them is the one left out: all are wrong
+                values = figures(cases.nuclide[nets == net], part, np.asarray(part.nuclide) == UNKNOWN)
+                rows.append({"case": "left out", "net": net, "depth_max": depth_max, "nuclide": name} | values)
+    return sorted(rows, key=lambda row: (row["net"], row["depth_max"]))
 
 
 def calibration(instrument: Instrument, n: int, rng: np.random.Generator) -> list[dict[str, float]]:
