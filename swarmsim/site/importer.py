@@ -159,7 +159,7 @@ def _finish(
     inside = ~ground.outside
     slope = np.degrees(np.arctan(np.hypot(*np.gradient(ground.height, grid.cell))))
     area = survey_area(grid, inside, spec)
-    starts = start_places(grid, ground.height, surface, coarse, cost, area)
+    starts = start_places(grid, ground.height, surface, coarse, cost, area, boxes)
     (west, south), (east, north) = grid.bounds
     report |= {
         "size_m": [grid.nx * grid.cell, grid.ny * grid.cell],
