@@ -182,14 +182,12 @@ def summary_table(summary: dict[str, Any], name: str) -> Table:
         _add_rows(table, content, _PHASE_ROWS, f"{phase}: ")
         if not content["in_time"]:
             table.add_row(f"{phase}: ended", "by its time limit")
-    for rows in (_FOUND_ROWS, _TIME_ROWS):
-        table.add_section()
-        _add_rows(table, summary, rows)
-        if rows is _FOUND_ROWS and summary.get("source") and summary.get("noticed_mbq"):
-            from swarmsim.results.finding import noticed_from
-
-            limits = noticed_from(summary["noticed_mbq"])
-            table.add_row("Others, in free view", f"noticed from {limits}" if limits else "not noticed", "")
+    table.add_section()
+    _add_rows(table, summary, _FOUND_ROWS)
+    if summary.get("source"):  # without one, the finding tells them
+        _add_limits(table, summary.get("noticed_mbq", {}))
+    table.add_section()
+    _add_rows(table, summary, _TIME_ROWS)
     table.add_section()
     _add_vehicles(table, summary["vehicles"])
     events = [event for event in summary["events"] if event["kind"] != "finished"]
@@ -208,6 +206,15 @@ def _add_rows(table: Table, content: dict[str, Any], rows: Sequence[tuple[str, s
             value = value.get(step) if isinstance(value, dict) else None
         if value is not None:
             table.add_row(prefix + label, value_text(value), unit)
+
+
+def _add_limits(table: Table, noticed_mbq: dict[str, float | None]) -> None:
+    """From which activities on other sources would have been noticed, if that is known."""
+    from swarmsim.results.finding import noticed_from
+
+    if noticed_mbq:
+        limits = noticed_from(noticed_mbq)
+        table.add_row("Others, in free view", f"noticed from {limits}" if limits else "not noticed", "")
 
 
 def _add_vehicles(table: Table, vehicles: Sequence[dict[str, Any]]) -> None:

@@ -25,7 +25,7 @@ OPTIONS = {"name": "the folder's name (--out)", "licence": "--licence", "cell_m"
 GIVEN_BY = {
     "unit_m": "--unit", "height_unit_m": "--height-unit", "up_axis": "--up", "ground": "--ground", "plane": "--plane"
 }  # fmt: skip
-"""The options of these."""
+"""Options of the fields in ``given``."""
 
 
 def import_site_file(

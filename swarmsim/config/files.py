@@ -65,13 +65,6 @@ def exists(path: Path) -> bool:
         return False
 
 
-def _meant(name: str, path: Path, beside: Iterable[str], known: Iterable[str]) -> str | None:
-    """A hint to what is meant by a ``name`` that names nothing: a file ``beside`` it, or one of the ``known`` names."""
-    if looks_like_path(name):
-        return did_you_mean(name, beside)
-    return f"if the file is meant, write './{name}'" if is_file(path) else did_you_mean(name, known)
-
-
 def _is_link(path: Path) -> bool:
     """Whether ``path`` is a symbolic link, to whatever."""
     try:
@@ -115,18 +108,23 @@ def find(kind: str, name: str | Path, near: Path | None = None) -> Path:
     known = available(kind, near)
     if str(name) in known:
         return known[str(name)]
-    beside = sorted(
-        str(path.parent / p.name) for p in listing(path.parent, "*") if p.suffix in _SUFFIXES and is_file(p)
-    )
+    if kind != "sites" and exists(path) and not is_file(path):
+        return path  # a folder, a pipe: whoever reads it says what it is
     if _is_link(path):
         raise InputError.of(
             f"'{name}' is a link to nothing", given=str(name), suggestion="mend the link, or name a file"
         )
-    if kind != "sites" and exists(path) and not is_file(path):
-        raise InputError.of(f"'{name}' is a folder, not a file", given=str(name), suggestion="name the YAML file in it")
     raise InputError.of(
         f"there is no {'file' if looks_like_path(str(name)) else kind.removesuffix('s')} '{name}'",
         given=str(name),
         allowed=f"{one_of(known)}; or the path of a file",
-        suggestion=_meant(str(name), path, beside, known),
+        suggestion=_meant(str(name), path, known),
     )
+
+
+def _meant(name: str, path: Path, known: Iterable[str]) -> str | None:
+    """A hint to what is meant by a ``name`` that names nothing: a file beside its ``path``, or one of the ``known``."""
+    if looks_like_path(name):
+        beside = [p for p in listing(path.parent, "*") if p.suffix in _SUFFIXES and is_file(p)]
+        return did_you_mean(name, sorted(str(path.parent / p.name) for p in beside))
+    return f"if the file is meant, write './{name}'" if is_file(path) else did_you_mean(name, known)

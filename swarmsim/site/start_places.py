@@ -14,11 +14,10 @@ APART_M = 4.0  # between two places
 FREE_M = (3.0, 2.0, 1.2)  # wanted distance to whatever stands near; the largest that some place has
 STANDS_M = 0.3  # what rises further above the ground stands on it
 SLOPE_MAX = 0.18  # rise per metre, 10 degrees
-TALL_M = 2.0  # boxes that begin higher above the ground leave room for a vehicle
 
 
 def start_places(
-    grid: Grid, ground: Floats, surface: Floats, clear: Floats, cost: Floats, area: Floats, boxes: Sequence[Box] = ()
+    grid: Grid, ground: Floats, surface: Floats, clear: Floats, cost: Floats, area: Floats, boxes: Sequence[Box]
 ) -> list[list[float]]:
     """At most `PLACES` places [x, y] (m, ENU) in the survey ``area`` [v, 2], spread over it; fewer on a small site.
 
@@ -42,12 +41,11 @@ def start_places(
 
 
 def _covered(grid: Grid, ground: Floats, boxes: Sequence[Box]) -> NDArray[np.bool_]:
-    """Cells [ny, nx] on whose ground a box stands, or above which one leaves no room."""
+    """Cells [ny, nx] above whose ground a box reaches."""
     found = np.zeros(ground.shape, bool)
     for box in boxes:
         window, inside = footprint(box, grid, margin=0.5 * grid.cell)
-        low, high = box.centre[2] - box.half[2], box.centre[2] + box.half[2]
-        found[window] |= inside & (high > ground[window]) & (low < ground[window] + TALL_M)
+        found[window] |= inside & (box.centre[2] + box.half[2] > ground[window])
     return found
 
 

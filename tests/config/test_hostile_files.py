@@ -96,9 +96,11 @@ def test_what_stands_where_a_mission_is_named(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a_folder").mkdir()
     (tmp_path / "a_file").touch()
+    os.mkfifo(tmp_path / "a_pipe")
     (tmp_path / "dangling.yaml").symlink_to("nowhere.yaml")
     told = {
-        "a_folder": "'a_folder' is a folder, not a file",
+        "a_folder": "a_folder: is a folder, not a file",
+        "a_pipe": "a_pipe: is not a regular file",
         "a_file": "if the file is meant, write './a_file'",
         "dangling.yaml": "'dangling.yaml' is a link to nothing",
         "dangling.yml": "there is no file 'dangling.yml'",

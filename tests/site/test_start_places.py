@@ -11,9 +11,9 @@ AREA = np.array([[-1.0, -1.0], [31.0, -1.0], [31.0, 31.0], [-1.0, 31.0]])
 FLAT = np.zeros((61, 61))
 
 
-def places(boxes: list[Box], surface: np.ndarray = FLAT) -> np.ndarray:
+def places(boxes: list[Box]) -> np.ndarray:
     far = np.full(FLAT.shape, 50.0)
-    return np.array(start_places(GRID, FLAT, surface, far, np.ones(FLAT.shape), AREA, boxes))
+    return np.array(start_places(GRID, FLAT, FLAT, far, np.ones(FLAT.shape), AREA, boxes))
 
 
 def test_on_bare_ground_they_are_far_from_one_another():
@@ -38,9 +38,9 @@ def test_none_is_beside_a_box_however_low_it_is():
     assert np.linalg.norm(places([])[0] - boxes[0].centre[:2]) < FREE_M[0]
 
 
-def test_what_hangs_higher_than_a_vehicle_or_lies_below_the_ground_is_no_hindrance():
-    high = Box((1.0, 1.0, 4.0), (2.0, 2.0, 1.0), (1.0, 0.0), 0.0)
+def test_a_box_below_the_ground_is_no_hindrance_and_one_above_it_is():
     below = Box((29.0, 29.0, -1.0), (2.0, 2.0, 0.9), (1.0, 0.0), 0.0)
-    assert np.array_equal(places([high, below]), places([]))
-    low = Box((1.0, 1.0, 2.5), (2.0, 2.0, 1.0), (1.0, 0.0), 0.0)
-    assert not np.array_equal(places([low]), places([]))
+    assert np.array_equal(places([below]), places([]))
+    for height in (2.5, 4.0):
+        above = Box((1.0, 1.0, height), (2.0, 2.0, 1.0), (1.0, 0.0), 0.0)
+        assert not np.array_equal(places([above]), places([]))
