@@ -13,6 +13,7 @@ from jax.extend import core
 
 In = TypeVar("In")
 Out = TypeVar("Out")
+Known = TypeVar("Known")
 
 AT_A_TIME = 64  # missions for which an accelerator computes what only some of them need: each is much by itself
 IN_STEP = 512  # missions that wait for one another, where what takes long is asked for inside, by `for_those` again
@@ -44,10 +45,9 @@ def among_cores(axis: str) -> Iterator[None]:
 
 def each(function: Callable[[In], Out], values: In, together: int) -> Out:
     """``function`` of every element of the leading axis; up to ``together`` (static) at a time on an accelerator."""
-    count = jax.tree.leaves(values)[0].shape[0]
     if on_processor():
-        axis = _CORES.get()
-        return jax.lax.map(function, values) if axis is None else _shared(function, values, count, axis)
+        return in_turn(lambda known, x: (known, function(x)), None, values)
+    count = jax.tree.leaves(values)[0].shape[0]
     # equal parts: a rest would be compiled as well
     size = max(n for n in range(1, min(together, count) + 1) if count % n == 0)
     parts = jax.tree.map(lambda x: x.reshape(count // size, size, *x.shape[1:]), values)
@@ -56,11 +56,25 @@ def each(function: Callable[[In], Out], values: In, together: int) -> Out:
     return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), found)
 
 
-def _shared(function: Callable[[In], Out], values: In, count: int, axis: str) -> Out:
-    """`each`, every device along ``axis`` taking its part of the ``count`` elements."""
+def in_turn(step: Callable[[Known, In], tuple[Known, Out]], start: Known, values: In) -> Out:
+    """What ``step`` returns of each element of the leading axis, with what it knows from those before; on a processor.
+
+    Every device of `among_cores` knows of its own part alone.
+    """
+    axis = _CORES.get()
+
+    def of_part(part: In) -> Out:
+        return jax.lax.scan(step, start, part)[1]
+
+    return of_part(values) if axis is None else _shared(of_part, values, axis)
+
+
+def _shared(function: Callable[[In], Out], values: In, axis: str) -> Out:
+    """``function`` of all of the leading axis, every device along ``axis`` taking its part of it."""
+    count = jax.tree.leaves(values)[0].shape[0]
     part = -(-count // jax.lax.axis_size(axis))
     mine = jnp.minimum(jax.lax.axis_index(axis) * part + jnp.arange(part), count - 1)
-    leaves, structure = jax.tree.flatten(jax.lax.map(function, jax.tree.map(lambda x: x[mine], values)))
+    leaves, structure = jax.tree.flatten(function(jax.tree.map(lambda x: x[mine], values)))
     # in one piece: it is their number that exchanges cost
     flat = jnp.concatenate([_as_floats(x).reshape(part, x[0].size) for x in leaves], axis=1)
     whole = jax.lax.all_gather(flat, axis, tiled=True)[:count]

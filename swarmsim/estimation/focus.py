@@ -10,11 +10,9 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from swarmsim.estimation.forward import Problem, Rates, Rest, rates, silent, ways_from
+from swarmsim.estimation.forward import Problem, Rates, Rest, few_rows, most_of, of_rows, rates, silent, ways_from
 from swarmsim.estimation.likelihood import height_precision, scaled_inverse
-from swarmsim.estimation.nodes import Span
 from swarmsim.estimation.normal_equations import Others, eliminated, linearised, sums_of, unknowns_of
 from swarmsim.estimation.state import State, without
 
@@ -27,7 +25,7 @@ DARK = 1e-3  # of the brightest rate per becquerel: darker windows count as if t
 
 def focused(problem: Problem, state: State, k: jax.Array) -> tuple[Problem, State]:
     """The same with at most `KEPT` windows of each span, those that tell most of source ``k``, and the `Rest`."""
-    if all(last - first <= KEPT for first, last, _, _ in problem.spans):
+    if few_rows(problem, KEPT):
         return problem, state
     others = without(state, k).added
     u = replace(state.unknowns, activity_bq=state.sources.activity_bq[k])
@@ -36,10 +34,10 @@ def focused(problem: Problem, state: State, k: jax.Array) -> tuple[Problem, Stat
     e, sources = eliminated(problem, model, u), u.others.shape[0]
     # what a straight line about the source would tell wrongly
     bent = log_rates[:-1] - log_rates[-1] - (places[:-1] - places[-1]) @ model.nearer
-    rows = _most(problem, e.products[0, 0] * jnp.mean(jnp.square(bent), axis=0))
+    rows = most_of(problem, e.products[0, 0] * jnp.mean(jnp.square(bent), axis=0), KEPT)
     information, push = sums_of(problem, model, sources, e, jnp.ones(u.gain.shape).at[rows].set(0.0))
     rest = Rest(information=information, push=push, unknowns=unknowns_of(model, u))
-    return replace(_of_rows(problem, rows), rest=rest), _state_of(state, rows)
+    return replace(of_rows(problem, rows, KEPT), rest=rest), _state_of(state, rows)
 
 
 def _looked_at(problem: Problem, state: State, k: jax.Array, lengths: jax.Array) -> tuple[Rates, jax.Array, jax.Array]:
@@ -60,40 +58,6 @@ def _looked_at(problem: Problem, state: State, k: jax.Array, lengths: jax.Array)
     # a scan keeps the rates of one place alone, and compiles them once
     source, (bright, places) = jax.lax.scan(lambda _, offset: look(offset), silent(problem), offsets)
     return source, jnp.log(bright + DARK * jnp.max(bright[-1]) + 1e-30), places
-
-
-def _most(problem: Problem, values: jax.Array) -> jax.Array:
-    """The rows [m] with the largest ``values`` [n] in each span, in ascending order."""
-    values = jnp.where(problem.measurements.valid, values, -1.0)
-    rows = [
-        first + jnp.sort(jax.lax.top_k(values[first:last], min(KEPT, last - first))[1])
-        for first, last, _, _ in problem.spans
-    ]
-    return jnp.concatenate(rows)
-
-
-def _of_rows(problem: Problem, rows: jax.Array) -> Problem:
-    """The problem with these rows [m] alone."""
-    spans: list[Span] = []
-    nodes, begin, at = [], 0, 0
-    for first, last, number, rays in problem.spans:
-        kept = min(KEPT, last - first)
-        own = rows[at : at + kept] - first
-        nodes.append(begin + (own[:, None] * rays + np.arange(rays)).reshape(-1))
-        spans.append((at, at + kept, number, rays))
-        begin, at = begin + (last - first) * rays, at + kept
-    chosen = jnp.concatenate(nodes)
-    return replace(
-        problem,
-        measurements=jax.tree.map(lambda x: x[rows], problem.measurements),
-        background=problem.background[rows],
-        pose_std_m=problem.pose_std_m[rows],
-        trust=problem.trust[rows],
-        detector=problem.detector[rows],
-        dead_s=problem.dead_s[rows],
-        nodes=jax.tree.map(lambda x: x[chosen], problem.nodes),
-        spans=tuple(spans),
-    )
 
 
 def _state_of(state: State, rows: jax.Array) -> State:

@@ -200,6 +200,45 @@ def with_one_ray(problem: Problem) -> Problem:
     return replace(problem, spans=spans, nodes=nodes_of(problem.site, problem.measurements, spans))
 
 
+def few_rows(problem: Problem, most: int) -> bool:
+    """Whether no span has more rows than ``most``."""
+    return all(last - first <= most for first, last, _, _ in problem.spans)
+
+
+def most_of(problem: Problem, values: jax.Array, most: int) -> jax.Array:
+    """The rows [m] with the largest ``values`` [n] in each span, ``most`` at most, in ascending order."""
+    values = jnp.where(problem.measurements.valid, values, -1.0)
+    rows = [
+        first + jnp.sort(jax.lax.top_k(values[first:last], min(most, last - first))[1])
+        for first, last, _, _ in problem.spans
+    ]
+    return jnp.concatenate(rows)
+
+
+def of_rows(problem: Problem, rows: jax.Array, most: int) -> Problem:
+    """The problem with these rows [m] alone, ``most`` of each span or all (`most_of`)."""
+    spans: list[Span] = []
+    nodes, begin, at = [], 0, 0
+    for first, last, number, rays in problem.spans:
+        kept = min(most, last - first)
+        own = rows[at : at + kept] - first
+        nodes.append(begin + (own[:, None] * rays + np.arange(rays)).reshape(-1))
+        spans.append((at, at + kept, number, rays))
+        begin, at = begin + (last - first) * rays, at + kept
+    chosen = jnp.concatenate(nodes)
+    return replace(
+        problem,
+        measurements=jax.tree.map(lambda x: x[rows], problem.measurements),
+        background=problem.background[rows],
+        pose_std_m=problem.pose_std_m[rows],
+        trust=problem.trust[rows],
+        detector=problem.detector[rows],
+        dead_s=problem.dead_s[rows],
+        nodes=jax.tree.map(lambda x: x[chosen], problem.nodes),
+        spans=tuple(spans),
+    )
+
+
 def silent(problem: Problem) -> Rates:
     """Rates of no source."""
     n, regions = problem.background.shape

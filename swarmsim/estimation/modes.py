@@ -1,6 +1,6 @@
 """Where the posterior of a source may have modes besides the one that the search has found.
 
-Between walls it has many, decimetres wide and metres apart. The screen of `swarmsim.estimation.search`, one ray to a
+Between walls it has many, decimetres wide and metres apart. The screen (`swarmsim.estimation.screen`), one ray to a
 window and no fit, agrees with fits to one or two in the logarithm within metres of the source: hundreds of places are
 screened all around, and again, ever closer, about those that are likely (population Monte Carlo: Cappé, Guillin, Marin
 and Robert, Journal of Computational and Graphical Statistics 13, 2004, 907).
@@ -14,18 +14,8 @@ from swarmsim.estimation.forward import Problem, with_one_ray
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.normal_equations import Others, Unknowns
 from swarmsim.estimation.pairs import COMPANION_M, ONE_M
-from swarmsim.estimation.search import (
-    GOLDEN_ANGLE_RAD,
-    TOGETHER,
-    Screen,
-    attempt,
-    bounds,
-    looked_at,
-    mirrored_place,
-    screen_of,
-    screened,
-    spread,
-)
+from swarmsim.estimation.screen import Screen, looked_at, screen_of, screened
+from swarmsim.estimation.search import GOLDEN_ANGLE_RAD, TOGETHER, attempt, bounds, mirrored_place, spread
 from swarmsim.estimation.seek import as_known
 from swarmsim.estimation.state import State
 from swarmsim.estimation.weights import drawn_evenly, even_normals, flattened

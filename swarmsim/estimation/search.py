@@ -12,19 +12,12 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from swarmsim.device import each, on_processor
+from swarmsim.device import each, for_those, in_turn, on_processor
 from swarmsim.estimation.fit import Settled, settle
-from swarmsim.estimation.forward import Problem, Rates, Ways, dead_time, rates, ways_from, with_one_ray
+from swarmsim.estimation.forward import Problem, Ways, dead_time, few_rows, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
-from swarmsim.estimation.normal_equations import (
-    MEAN_FLOOR,
-    Others,
-    Unknowns,
-    inverse_of_two,
-    linearised,
-    normal_equations,
-    of_window,
-)
+from swarmsim.estimation.normal_equations import Others, Unknowns
+from swarmsim.estimation.screen import NEARBY, NEAREST_M, Screen, nearby, screened, screened_near
 from swarmsim.pytree import pytree
 from swarmsim.site import sample
 from swarmsim.site.model import bounds_m
@@ -34,9 +27,7 @@ GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
 FITTED = 4  # of the candidates of a round: the best of each part
 STEPS = 4  # Gauss-Newton steps at a place
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
-ROUNDING = 1e-5  # of sums over all windows, relative
 FARTHEST = 6.0  # standard deviations of a place within which others are looked for along its uncertainty
-NEAREST_M = 0.1  # of a window from a source: nearer ones tell no more
 TOGETHER = 24  # places that an accelerator looks at side by side
 
 Bounds = tuple[jax.Array, jax.Array]  # lower and upper [3]
@@ -60,6 +51,8 @@ class Candidates:
     allowed: jax.Array  # [C] bool, whether it is one
     sure: jax.Array  # [C] bool, to be fitted in any case; one of its part at most
     apart: jax.Array  # [] bool, whether the best of each part is fitted, or the best of all
+    near: jax.Array  # [] bool, whether all are of the nuclide of the best so far, and near it
+    reach_m: jax.Array  # [] how near
 
 
 def attempt(
@@ -78,136 +71,6 @@ def attempt(
     u = replace(u, lengths=jnp.where(fitted, 0.0, u.lengths))
     fit = settle(problem, ways_from(problem, place), nuclide, others, u, STEPS, fresh=True, fitted=fitted)
     return Tried(place=place, nuclide=nuclide, fit=fit)
-
-
-@pytree
-class Screen:
-    """What the posterior of other places is approximated with: the fit at one place, linearised. Windows come last."""
-
-    nuclide: jax.Array  # [] int32 of the source of the fit
-    left: jax.Array  # [R, n] counts less those of everything but the source sought
-    weight: jax.Array  # [R, n] over their variance
-    own: jax.Array  # [2, R, n] change with the window's own unknowns
-    of_others: jax.Array  # [R, n] of it what the other sources have of the gain's
-    inverse: jax.Array  # [2, 2, n] of the information about those
-    precision: jax.Array  # [2, n] of their priors
-    registered: jax.Array  # [n] of the counts that are added
-    there: jax.Array  # [C, R, n] change with the source of the fit (log activity, place), and with the other sources
-    there_own: jax.Array  # [C, 2, n] of it the part that the window's own unknowns take up
-    there_inverse: jax.Array  # [C, C] of the information about those
-
-
-def screen_of(
-    problem: Problem, others: Others, source: Rates, nuclide: jax.Array, where: jax.Array, u: Unknowns
-) -> Screen:  # fmt: skip
-    """The screen from the fit ``u`` with a source of ``nuclide`` at ``where`` [3] (world) that adds ``source``."""
-    m = problem.measurements
-    assert m.rois is not None
-    model = linearised(problem, source, others, where, u)
-    zero = jnp.zeros_like(u.gain)
-    sources = 1 + u.others.shape[0]
-    own, at = of_window(model.columns, sources - 1), normal_equations(problem, model, u)
-    inverse = at.own
-    weight = jnp.where(m.valid, problem.trust.T / jnp.maximum(model.mean, MEAN_FLOOR), 0.0)
-    there = jnp.concatenate([model.columns[:1], model.columns[0] * model.nearer[:, None], model.columns[1:sources]])
-    inside = jnp.sum(own * (weight * there)[:, None], axis=2)  # [C, 2, n]
-    there_own = jnp.einsum("abn,cbn->can", inverse, inside)
-    information = jnp.einsum("crn,drn->cd", there * weight, there) - jnp.einsum("can,dan->cd", there_own, inside)
-    information = information.at[3, 3].add(height_precision(problem.height_std_m))
-    rest = linearised(problem, source, others, where, replace(u, background=zero, gain=zero, activity_bq=jnp.zeros(())))
-    return Screen(
-        nuclide=nuclide,
-        left=jnp.where(m.valid, m.rois.T - rest.mean, 0.0),
-        weight=weight,
-        own=own,
-        of_others=own[1] - model.columns[0],
-        inverse=inverse,
-        precision=at.precision,
-        registered=model.registered,
-        there=there,
-        there_own=there_own,
-        there_inverse=scaled_inverse(information),
-    )
-
-
-@pytree
-class _Seen:
-    """A source of 1 Bq at a place, by a screen."""
-
-    weighted: jax.Array  # [R, n] what it adds over the variance of the counts
-    inside: jax.Array  # [2, n] what the window's own unknowns have of it
-    whole: jax.Array  # [] information about its activity with those known
-    information: jax.Array  # [] and with those unknown
-    score: jax.Array  # []
-
-
-def _seen(problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array, ways: Ways | None = None) -> _Seen:
-    lengths, ways = jnp.zeros_like(problem.material_std), ways_from(problem, place) if ways is None else ways
-    net = rates(problem, ways, nuclide, lengths, slopes=False).counts.T * screen.registered
-    weighted = screen.weight * net
-    own, inverse = _own(screen, nuclide, net)
-    inside = jnp.sum(own * weighted, axis=1)
-    of_left = jnp.sum(own * screen.weight * screen.left, axis=1)
-    back = inverse[:, 0] * inside[0] + inverse[:, 1] * inside[1]
-    whole = jnp.sum(weighted * net)
-    return _Seen(
-        weighted=weighted,
-        inside=inside,
-        whole=whole,
-        information=whole - jnp.sum(back * inside),
-        score=jnp.sum(weighted * screen.left) - jnp.sum(back * of_left),
-    )
-
-
-def _own(screen: Screen, nuclide: jax.Array, net: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Change [2, R, n] with the window's own unknowns, and the inverse [2, 2, n] of the information about those.
-
-    A window's gain multiplies what its sources add. With that of the source of the fit, which has the spectrum of
-    another nuclide, any nuclide would explain what that one does.
-    """
-    of_fit = jnp.sum(screen.own[1] - screen.of_others, axis=0)
-    total = jnp.sum(net, axis=0)
-    # both are negative where a detector beyond saturation registers less for more
-    some = total != 0.0
-    gain = screen.of_others + net * jnp.where(some, of_fit / jnp.where(some, total, 1.0), 0.0)
-    alike = nuclide == screen.nuclide
-    own = jnp.stack([screen.own[0], jnp.where(alike, screen.own[1], gain)])
-    h = jnp.sum(own[:, None] * own * screen.weight, axis=2) + screen.precision[:, None] * jnp.eye(2)[..., None]
-    return own, jnp.where(alike, screen.inverse, inverse_of_two(h)[0])
-
-
-def _value(problem: Problem, seen: _Seen, place: jax.Array) -> jax.Array:
-    deviation = place[2] - problem.height_m
-    prior = 0.5 * height_precision(problem.height_std_m) * jnp.square(deviation)
-    value = 0.5 * jnp.square(jnp.maximum(seen.score, 0.0)) / jnp.maximum(seen.information, 1e-30) - prior
-    # what walls hide all of, and what is as nothing beside rounding, explains no count
-    return jnp.where(jnp.isfinite(value) & (seen.information > ROUNDING * seen.whole), value, -prior)
-
-
-def screened(
-    problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array, ways: Ways | None = None
-) -> jax.Array:  # fmt: skip
-    """About the log posterior [] at ``place`` [3], up to a constant: the activity and the windows' unknowns fitted.
-
-    ``ways`` are those from there, if they are known.
-    """
-    return _value(problem, _seen(problem, screen, nuclide, place, ways), place)
-
-
-def looked_at(
-    problem: Problem, screen: Screen, nuclide: jax.Array, place: jax.Array
-) -> tuple[jax.Array, jax.Array]:  # fmt: skip
-    """What `screened` finds with a source at ``place`` [3] in the place of that of the fit; and with one beside it.
-
-    The latter is the information [] (1/Bq^2) about its activity. The place and activity of the source of the fit are
-    unknown then, and the activities of the others.
-    """
-    seen = _seen(problem, screen, nuclide, place)
-    both = jnp.einsum("rn,crn->c", seen.weighted, screen.there) - jnp.einsum(
-        "can,an->c", screen.there_own, seen.inside
-    )  # fmt: skip
-    beside = seen.information - both @ screen.there_inverse @ both
-    return _value(problem, seen, place), jnp.where(beside > ROUNDING * seen.whole, beside, 0.0)
 
 
 def spread(centre: jax.Array, reach_m: jax.Array, up_m: jax.Array, count: int, turn: jax.Array) -> jax.Array:
@@ -292,8 +155,7 @@ def best_of(
     """
     low, high = bounds(problem)
     places, c = jnp.clip(candidates.place, low, high), candidates
-    quick = with_one_ray(problem)
-    seen = _screened(quick, screen, c.nuclide, places, c.allowed | c.sure)
+    seen = _looked_at(with_one_ray(problem), screen, replace(c, place=places), best)
     rank = jnp.where(c.sure, jnp.inf, jnp.where(c.allowed, seen, -jnp.inf))
     parts = rank.reshape(FITTED, -1)
     of_parts = jnp.argmax(parts, axis=1) + jnp.arange(FITTED) * parts.shape[1]
@@ -310,6 +172,25 @@ def best_of(
     return jax.tree.map(lambda a, b: jnp.where(better, a[first], b), tried, best), values
 
 
+def _looked_at(problem: Problem, screen: Screen, c: Candidates, best: Tried) -> jax.Array:
+    """What a screen finds at each of the candidates [C]; of those not allowed anything."""
+
+    def of_all() -> jax.Array:
+        return _screened(problem, screen, c.nuclide, c.place, c.allowed | c.sure)
+
+    if few_rows(problem, NEARBY):
+        return of_all()
+    nothing = jnp.zeros(c.allowed.shape)
+
+    def of_few() -> jax.Array:
+        fit = best.fit
+        near = nearby(problem, fit.rates, fit.unknowns.activity_bq, best.place, c.reach_m)
+        return each(lambda place: screened_near(problem, screen, near, place), c.place, TOGETHER)
+
+    close = for_those(c.near, of_few, lambda: nothing)
+    return jnp.where(c.near, close, for_those(~c.near, of_all, lambda: nothing))
+
+
 def _screened(
     problem: Problem, screen: Screen, nuclide: jax.Array, places: jax.Array, asked: jax.Array
 ) -> jax.Array:  # fmt: skip
@@ -319,20 +200,21 @@ def _screened(
     """
     if not on_processor():
         return each(lambda x: screened(problem, screen, x[1], x[0]), (places, nuclide), TOGETHER)
-    alike, first = jnp.all(places == places[0]), partial(ways_from, problem, places[0])
-    unseen = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(first))
-    known = jax.lax.cond(alike, first, lambda: unseen)
+    unseen: Ways = jax.eval_shape(partial(ways_from, problem, places[0]))
+    nowhere = jnp.full(3, jnp.nan), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unseen)
+    Known = tuple[jax.Array, Ways]
 
-    def one(x: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+    def one(known: Known, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Known, jax.Array]:
         place, nuclide, asked = x
 
-        def look() -> jax.Array:
-            ways = jax.lax.cond(alike, lambda: known, lambda: ways_from(problem, place))
-            return screened(problem, screen, nuclide, place, ways)
+        def look() -> tuple[Known, jax.Array]:
+            at, ways = known
+            ways = jax.lax.cond(jnp.all(place == at), lambda: ways, lambda: ways_from(problem, place))
+            return (place, ways), screened(problem, screen, nuclide, place, ways)
 
-        return jax.lax.cond(asked, look, lambda: jnp.zeros(()))
+        return jax.lax.cond(asked, look, lambda: (known, jnp.zeros(())))
 
-    return each(one, (places, nuclide, asked), TOGETHER)
+    return in_turn(one, nowhere, (places, nuclide, asked))
 
 
 def bounds(problem: Problem) -> Bounds:

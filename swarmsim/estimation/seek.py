@@ -16,7 +16,8 @@ from swarmsim.estimation.forward import Problem, Rates, variance_of
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.normal_equations import Others
 from swarmsim.estimation.overload import prominent
-from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, screen_of, spread, spread_along
+from swarmsim.estimation.screen import screen_of
+from swarmsim.estimation.search import FITTED, Candidates, Tried, best_of, spread, spread_along
 from swarmsim.estimation.starts import STARTS, Places, Starts, no_starts, starts_of
 from swarmsim.estimation.state import State, Suspect, nobody, shared, without
 from swarmsim.pytree import pytree, static
@@ -144,6 +145,8 @@ def _best(
             allowed=~indoors | starts.there[room],
             sure=known_one,
             apart=~indoors,
+            near=no[0],
+            reach_m=reaches[number],
         )
 
     def name(best: Tried, number: jax.Array) -> Candidates:
@@ -153,7 +156,9 @@ def _best(
         kinds = jnp.minimum(everyone, known - 1)
         # the nuclide so far is compared with the others in any case
         sure = asked & (everyone == best.nuclide)
-        return Candidates(place=places, nuclide=kinds, allowed=asked, sure=sure, apart=no[0])
+        return Candidates(
+            place=places, nuclide=kinds, allowed=asked, sure=sure, apart=no[0], near=no[0], reach_m=reaches[number]
+        )  # fmt: skip
 
     def around(best: Tried, number: jax.Array) -> Candidates:
         reach_m, index = reaches[number], jnp.arange(size)
@@ -164,8 +169,9 @@ def _best(
         # the best place so far is the first candidate: the tolerance is another now
         sure = (index == 0) | (index == size - part)
         places = jnp.where((index == 0)[:, None], best.place, places)
+        nuclide = jnp.full(size, best.nuclide)
         return Candidates(
-            place=places, nuclide=jnp.full(size, best.nuclide), allowed=yes, sure=sure, apart=yes[0]
+            place=places, nuclide=nuclide, allowed=yes, sure=sure, apart=yes[0], near=yes[0], reach_m=reach_m
         )  # fmt: skip
 
     def round_(carry: _Rounds) -> _Rounds:

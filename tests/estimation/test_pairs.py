@@ -12,7 +12,7 @@ from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.pairs import are_mixed, divided, joined, strain
 from swarmsim.estimation.posterior import of_others
-from swarmsim.estimation.search import looked_at, screen_of
+from swarmsim.estimation.screen import looked_at, screen_of
 from swarmsim.estimation.seek import as_known
 from swarmsim.estimation.state import no_sources, settled, signals, without
 from tests.estimation.conftest import BOTH, DETECTORS, SPANS

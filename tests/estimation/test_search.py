@@ -13,7 +13,8 @@ from swarmsim.estimation.forward import ways_from
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
-from swarmsim.estimation.search import Screen, Tried, _own, _screened, attempt, screen_of, screened, spread_along
+from swarmsim.estimation.screen import Screen, _own, screen_of, screened
+from swarmsim.estimation.search import Tried, _screened, attempt, spread_along
 from swarmsim.estimation.seek import least_of
 from swarmsim.estimation.seek import sought as seek
 from swarmsim.estimation.state import no_sources, settled, signals
