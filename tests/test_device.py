@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import PartitionSpec as P
 
 from swarmsim import device
 
@@ -20,6 +21,25 @@ def test_each_is_the_function_of_every_element(processor, count):
     np.testing.assert_array_equal(found, values["a"] * values["b"].sum(axis=1))
     empty = jax.jit(lambda v: device.each(lambda x: jnp.zeros((3, 0)), v, 4))(values)
     assert empty.shape == (count, 3, 0)
+
+
+def test_in_turn_what_comes_later_knows_what_came_before():
+    """Of its own device's part alone."""
+
+    def step(known, x):
+        return known + x, known
+
+    values = jnp.arange(1.0, 6.0)
+    before = jax.jit(lambda v: device.in_turn(step, jnp.zeros(()), v))(values)
+    np.testing.assert_array_equal(before, [0.0, 1.0, 3.0, 6.0, 10.0])
+    mesh = jax.make_mesh((2,), ("cores",))
+
+    def shared(v):
+        with device.among_cores("cores"):
+            return device.in_turn(step, jnp.zeros(()), v)
+
+    spread = jax.shard_map(shared, mesh=mesh, in_specs=P(), out_specs=P(), check_vma=False)
+    np.testing.assert_array_equal(jax.jit(spread)(values), [0.0, 1.0, 3.0, 0.0, 4.0])
 
 
 def test_branches_are_chosen_by_each_mission(processor):
