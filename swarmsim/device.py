@@ -32,7 +32,7 @@ def on_processor() -> bool:
 
 @contextmanager
 def among_cores(axis: str) -> Iterator[None]:
-    """What is traced inside shares the elements of `each` among the devices along that ``axis`` of a mesh.
+    """What is traced inside shares the elements of `each` and `in_turn` among the devices along an ``axis`` of a mesh.
 
     All else is computed by each of them alike, so that none waits for what another one decides.
     """
@@ -57,9 +57,10 @@ def each(function: Callable[[In], Out], values: In, together: int) -> Out:
 
 
 def in_turn(step: Callable[[Known, In], tuple[Known, Out]], start: Known, values: In) -> Out:
-    """What ``step`` returns of each element of the leading axis, with what it knows from those before; on a processor.
+    """The second result of ``step``, of what is known and an element, for every element of the leading axis.
 
-    Every device of `among_cores` knows of its own part alone.
+    Its first result is what is known at the next element, ``start`` at the first one. For a processor; every device of
+    `among_cores` begins its part of the elements with ``start``.
     """
     axis = _CORES.get()
 

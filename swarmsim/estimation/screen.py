@@ -9,7 +9,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from swarmsim.estimation.forward import Problem, Rates, Ways, most_of, of_rows, rates, ways_from
+from swarmsim.estimation.forward import Problem, Rates, Ways, dead_time, most_of, of_rows, rates, ways_from
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.normal_equations import (
     MEAN_FLOOR,
@@ -153,16 +153,18 @@ class Nearby:
     few: Problem  # those windows
     rows: jax.Array  # [m] which they are
     added: jax.Array  # [R, n] true counts of a source of 1 Bq by the fit
-    squared_m2: jax.Array  # [n] distance of each window from there, squared
+    activity_bq: jax.Array  # [] of the fit
+    squared_m2: jax.Array  # [n] distance of each window from its place, squared
 
 
 def nearby(
     problem: Problem, source: Rates, activity_bq: jax.Array, place: jax.Array, reach_m: jax.Array
 ) -> Nearby:  # fmt: skip
-    """For places within about ``reach_m`` [] of ``place`` [3], where a fit has a ``source``; by one ray each.
+    """For places around ``place`` [3], where a fit has ``activity_bq`` [] of a ``source``; by one ray each.
 
-    The windows taken are those of which the most of the distance would be known, were nothing in the way, and for which
-    it changes most: in the shadow of a wall may lie what tells most of a place beside it.
+    Taken are the windows that would tell most of the distance if nothing were in the way, and whose distance changes
+    most within about ``reach_m`` []. A window in the shadow of a wall may tell most of a place beside it, so shadows do
+    not count here; what an overloaded counter does not register does.
     """
     m, added = problem.measurements, source.counts.T
     squared = _squared_m2(problem, position_of(problem.site, place))
@@ -170,22 +172,27 @@ def nearby(
     strength = jnp.where(m.valid, jnp.sum(added, axis=0) * squared / exposure_s, 0.0)
     amount = activity_bq * jnp.max(strength) * exposure_s / squared
     mean = amount + jnp.sum(problem.background, axis=1)
-    known = jnp.square(amount) / (jnp.square(problem.model_std * amount) + jnp.maximum(mean, MEAN_FLOOR))
-    rows = most_of(problem, known * jnp.minimum(jnp.square(reach_m) / squared, 1.0), NEARBY)
-    return Nearby(few=of_rows(problem, rows, NEARBY), rows=rows, added=added, squared_m2=squared)
+    share, fall = dead_time(problem, mean)
+    change, registered = jnp.abs(share + fall * mean) * amount, jnp.maximum(share * mean, MEAN_FLOOR)
+    information = jnp.square(change) / (jnp.square(problem.model_std * change) + registered)
+    rows = most_of(problem, information * jnp.minimum(jnp.square(reach_m) / squared, 1.0), NEARBY)
+    few = of_rows(problem, rows, NEARBY)
+    return Nearby(few=few, rows=rows, added=added, activity_bq=activity_bq, squared_m2=squared)
 
 
 def screened_near(problem: Problem, screen: Screen, near: Nearby, place: jax.Array) -> jax.Array:
     """`screened` [] with the nuclide of the screen's fit.
 
-    What the windows without rays count changes with the distance, and by the factor that those with rays have in common
-    besides.
+    What the windows without rays count changes with the inverse square of the distance, times a factor that is fitted
+    to those with rays.
     """
     few = _added(near.few, screen.nuclide, ways_from(near.few, place))
-    others = near.added * (near.squared_m2 / _squared_m2(problem, position_of(problem.site, place)))
-    expected, weight = others[:, near.rows], screen.weight[:, near.rows] * jnp.square(screen.registered[near.rows])
-    common = jnp.sum(weight * expected * few) / jnp.maximum(jnp.sum(weight * jnp.square(expected)), 1e-30)
-    return _value(problem, _seen(screen, screen.nuclide, (common * others).at[:, near.rows].set(few)), place)
+    rest = near.added * (near.squared_m2 / _squared_m2(problem, position_of(problem.site, place)))
+    expected = rest[:, near.rows]
+    weight = screen.weight[:, near.rows] * jnp.square(near.activity_bq * screen.registered[near.rows])
+    # with a prior about one, as wide as one: where no counter registers more for more there is no other
+    factor = (jnp.sum(weight * expected * few) + 1.0) / (jnp.sum(weight * jnp.square(expected)) + 1.0)
+    return _value(problem, _seen(screen, screen.nuclide, (factor * rest).at[:, near.rows].set(few)), place)
 
 
 def _squared_m2(problem: Problem, where: jax.Array) -> jax.Array:

@@ -52,7 +52,7 @@ class Candidates:
     sure: jax.Array  # [C] bool, to be fitted in any case; one of its part at most
     apart: jax.Array  # [] bool, whether the best of each part is fitted, or the best of all
     near: jax.Array  # [] bool, whether all are of the nuclide of the best so far, and near it
-    reach_m: jax.Array  # [] how near
+    reach_m: jax.Array  # [] how near; a third of them up to three times as far
 
 
 def attempt(
@@ -155,7 +155,7 @@ def best_of(
     """
     low, high = bounds(problem)
     places, c = jnp.clip(candidates.place, low, high), candidates
-    seen = _looked_at(with_one_ray(problem), screen, replace(c, place=places), best)
+    seen = _screened_all(with_one_ray(problem), screen, replace(c, place=places), best)
     rank = jnp.where(c.sure, jnp.inf, jnp.where(c.allowed, seen, -jnp.inf))
     parts = rank.reshape(FITTED, -1)
     of_parts = jnp.argmax(parts, axis=1) + jnp.arange(FITTED) * parts.shape[1]
@@ -172,8 +172,8 @@ def best_of(
     return jax.tree.map(lambda a, b: jnp.where(better, a[first], b), tried, best), values
 
 
-def _looked_at(problem: Problem, screen: Screen, c: Candidates, best: Tried) -> jax.Array:
-    """What a screen finds at each of the candidates [C]; of those not allowed anything."""
+def _screened_all(problem: Problem, screen: Screen, c: Candidates, best: Tried) -> jax.Array:
+    """What the screen of the fit of ``best`` finds at each of the candidates [C]; of those not allowed anything."""
 
     def of_all() -> jax.Array:
         return _screened(problem, screen, c.nuclide, c.place, c.allowed | c.sure)

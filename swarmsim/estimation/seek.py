@@ -169,9 +169,9 @@ def _best(
         # the best place so far is the first candidate: the tolerance is another now
         sure = (index == 0) | (index == size - part)
         places = jnp.where((index == 0)[:, None], best.place, places)
-        nuclide = jnp.full(size, best.nuclide)
+        nuclide, near = jnp.full(size, best.nuclide), number >= closer
         return Candidates(
-            place=places, nuclide=nuclide, allowed=yes, sure=sure, apart=yes[0], near=yes[0], reach_m=reach_m
+            place=places, nuclide=nuclide, allowed=yes, sure=sure, apart=yes[0], near=near, reach_m=reach_m
         )  # fmt: skip
 
     def round_(carry: _Rounds) -> _Rounds:

@@ -10,7 +10,7 @@ import pytest
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation import screen as screen_module
 from swarmsim.estimation.fit import settle
-from swarmsim.estimation.forward import ways_from, with_one_ray
+from swarmsim.estimation.forward import rates, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
@@ -19,7 +19,18 @@ from swarmsim.estimation.search import Tried, _screened, attempt, spread, spread
 from swarmsim.estimation.seek import least_of
 from swarmsim.estimation.seek import sought as seek
 from swarmsim.estimation.state import no_sources, settled, signals
-from tests.estimation.survey import NUCLIDES, drawn, mean_rois, orbit, place, presumed, spec, spectrometer, survey
+from tests.estimation.survey import (
+    NUCLIDES,
+    counted,
+    drawn,
+    mean_rois,
+    orbit,
+    place,
+    presumed,
+    spec,
+    spectrometer,
+    survey,
+)
 
 CO_60 = jnp.int32(NUCLIDES.index("Co-60"))
 DETECTORS = (spectrometer(),)
@@ -189,8 +200,28 @@ def test_few_windows_tell_places_near_one_another_apart_as_all_do(monkeypatch):
         assert len(set(rows)) == 48
         assert np.ptp(by_all) > 300.0
         assert np.corrcoef(by_all, by_few)[0, 1] > alike
+        if not boxes:
+            assert np.std(by_few - by_all) < 0.05 * np.ptp(by_all)
         # of 48, the one to be fitted is one of the best ten
         assert np.sum(by_all > by_all[np.argmax(by_few)]) < 10
+
+
+@pytest.mark.parametrize(("activity", "far"), [(1e9, 0), (3e11, 24)])
+def test_windows_that_an_overloaded_counter_hardly_registers_tell_no_places_apart(monkeypatch, activity, far):
+    """Of 40 windows 2 m from a source and 40 windows 20 m from it, the former are deaf if it is strong."""
+    monkeypatch.setattr(screen_module, "NEARBY", 24)
+    m = concatenate(*(orbit((3.0, 3.5), radius, 40, which=0) for radius in (2.0, 20.0)))
+    site = place([], half=40.0)
+    m = counted(m, mean_rois(site, DETECTORS, m))
+
+    @jax.jit
+    def rows(known, m):
+        problem = with_one_ray(problem_of(known, m, ((0, 80, 0, 1),)))
+        at = jnp.float32(AT)
+        source = rates(problem, ways_from(problem, at), CO_60, jnp.zeros_like(problem.material_std))
+        return nearby(problem, source, jnp.float32(activity), at, jnp.float32(1.0)).rows
+
+    assert np.sum(np.asarray(rows(presumed(site, DETECTORS, half=40.0), m)) >= 40) == far
 
 
 def test_a_further_source_must_explain_more_than_the_first():
