@@ -202,17 +202,17 @@ def _screened(
         return each(lambda x: screened(problem, screen, x[1], x[0]), (places, nuclide), TOGETHER)
     unseen: Ways = jax.eval_shape(partial(ways_from, problem, places[0]))
     nowhere = jnp.full(3, jnp.nan), jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), unseen)
-    Known = tuple[jax.Array, Ways]
+    Last = tuple[jax.Array, Ways]  # the last place and the ways from there
 
-    def one(known: Known, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Known, jax.Array]:
+    def one(last: Last, x: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[Last, jax.Array]:
         place, nuclide, asked = x
 
-        def look() -> tuple[Known, jax.Array]:
-            at, ways = known
+        def look() -> tuple[Last, jax.Array]:
+            at, ways = last
             ways = jax.lax.cond(jnp.all(place == at), lambda: ways, lambda: ways_from(problem, place))
             return (place, ways), screened(problem, screen, nuclide, place, ways)
 
-        return jax.lax.cond(asked, look, lambda: (known, jnp.zeros(())))
+        return jax.lax.cond(asked, look, lambda: (last, jnp.zeros(())))
 
     return in_turn(one, nowhere, (places, nuclide, asked))
 

@@ -7,15 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from swarmsim import device
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation import screen as screen_module
+from swarmsim.estimation import search as search_module
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import rates, ways_from, with_one_ray
 from swarmsim.estimation.likelihood import position_of
 from swarmsim.estimation.localise import localisation_params, problem_of
 from swarmsim.estimation.measurements import concatenate
 from swarmsim.estimation.screen import Screen, _own, nearby, screen_of, screened, screened_near
-from swarmsim.estimation.search import Tried, _screened, attempt, spread, spread_along
+from swarmsim.estimation.search import Candidates, Tried, _screened, _screened_all, attempt, spread, spread_along
 from swarmsim.estimation.seek import least_of
 from swarmsim.estimation.seek import sought as seek
 from swarmsim.estimation.state import no_sources, settled, signals
@@ -204,6 +206,38 @@ def test_few_windows_tell_places_near_one_another_apart_as_all_do(monkeypatch):
             assert np.std(by_few - by_all) < 0.05 * np.ptp(by_all)
         # of 48, the one to be fitted is one of the best ten
         assert np.sum(by_all > by_all[np.argmax(by_few)]) < 10
+
+
+@pytest.mark.parametrize("processor", [True, False], ids=["processor", "accelerator"])
+def test_candidates_near_the_best_are_screened_by_few_windows_and_all_others_by_all(monkeypatch, processor):
+    for module in (screen_module, search_module):
+        monkeypatch.setattr(module, "NEARBY", 24)
+    for module in (device, search_module):
+        monkeypatch.setattr(module, "on_processor", lambda: processor)
+    known, m = told(WALLS)
+
+    @jax.jit
+    def found(known, m, at):
+        problem = problem_of(known, m, SPANS)
+        nothing = no_sources(problem, 1, len(NUCLIDES))
+        best = attempt(problem, CO_60, nothing.added, nothing.unknowns, at)
+        quick, u = with_one_ray(problem), best.fit.unknowns
+        screen = screen_of(problem, nothing.added, best.fit.rates, CO_60, position_of(problem.site, at), u)
+        places, reach = spread(at, jnp.float32(1.0), jnp.float32(0.3), 8, jnp.float32(0.0)), jnp.float32(1.0)
+        near = nearby(quick, best.fit.rates, u.activity_bq, at, reach)
+        one = Candidates(
+            place=places, nuclide=jnp.full(8, CO_60), allowed=jnp.ones(8, bool), sure=jnp.zeros(8, bool),
+            apart=jnp.array(True), near=jnp.array(True), reach_m=reach,
+        )  # fmt: skip
+        both = jax.vmap(lambda yes: _screened_all(quick, screen, replace(one, near=yes), best))(
+            jnp.array([True, False])
+        )
+        by_few = jax.lax.map(lambda at: screened_near(quick, screen, near, at), places)
+        return both, by_few, jax.lax.map(lambda at: screened(quick, screen, CO_60, at), places)
+
+    both, by_few, by_all = found(known, m, jnp.float32(AT + 0.3))
+    np.testing.assert_allclose(both, [by_few, by_all], rtol=1e-4, atol=1e-2)
+    assert np.max(np.abs(np.asarray(by_few - by_all))) > 1.0
 
 
 @pytest.mark.parametrize(("activity", "far"), [(1e9, 0), (3e11, 24)])
