@@ -28,7 +28,6 @@ from swarmsim.estimation.overload import likeliest, overloaded
 from swarmsim.pytree import pytree
 from swarmsim.site import sample
 
-MORE_STEPS = 2  # of Gauss-Newton, with the rates at the lengths that the first ones came to
 LEVEL_STEPS = 8  # of the activity that the windows' own ones are put together to
 FAR_OFF = 4.0  # standard deviations of its counts, from which on the gain of a window does not start at zero
 FARTHEST_GAIN = 5.0  # logarithm of a window's rate over the model's, where a fit starts
@@ -55,9 +54,9 @@ def settle(
     others: Others,
     start: Unknowns,
     steps: int,
+    passes: int = 1,
     *,
     fresh: bool = False,
-    exact: bool = True,
     fitted: jax.Array | bool = True,
 ) -> Settled:
     """Fit all unknowns for a source of ``nuclide`` at the place that ``ways`` lead from.
@@ -68,17 +67,17 @@ def settle(
         nuclide: [] int32.
         others: other sources.
         start: where to begin.
-        steps: of Gauss-Newton (static).
+        steps: of Gauss-Newton in each pass (static).
+        passes: how often the rates are computed, each time with the lengths that the steps before came to; after each
+            step, the last one too, they are extrapolated (`lengthened`; static).
         fresh: whether the place is a new one: then the activity and the windows' own unknowns are not taken from
             ``start`` (static).
-        exact: whether the rates are computed again with the lengths that were fitted, and a few further steps done;
-            else they are extrapolated (`lengthened`; static).
         fitted: [] bool; where it is False the rates are computed and no step is done.
     """
-    passes = [steps, MORE_STEPS] if exact and problem.uncertain else [steps]
-    # a loop of known length, unless something else is asked
-    count = len(passes) if fitted is True else jnp.where(fitted, len(passes), 1)
-    steps_of = jnp.where(fitted, jnp.array(passes), 0)
+    # where no length is uncertain the rates are the same in all passes
+    passes, steps = (passes, steps) if problem.uncertain else (1, passes * steps)
+    # loops of known length, unless something else is asked
+    count, moves = (passes, steps) if fitted is True else (jnp.where(fitted, passes, 1), jnp.where(fitted, steps, 0))
 
     def linear(u: Unknowns, source: Rates) -> Linearised:
         return linearised(problem, source, others, ways.position_m, u)
@@ -93,7 +92,7 @@ def settle(
         source = rates(problem, ways, nuclide, u.lengths)
         if fresh:
             u = jax.lax.cond(number == 0, lambda: _begun(problem, source, others, ways.position_m, u), lambda: u)
-        return jax.lax.fori_loop(0, steps_of[number], step, (u, source))
+        return jax.lax.fori_loop(0, moves, step, (u, source))
 
     # a loop, so that what a pass does is compiled once
     u, source = jax.lax.fori_loop(0, count, pass_, (start, silent(problem)))

@@ -22,6 +22,8 @@ from swarmsim.site.rays import Crossed, crossed_from, stretched
 
 EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
 
+MOST_BY_LENGTHS = 20.0  # that the logarithm of a rate changes by with the lengths, in one step
+
 
 @pytree
 class Rest:
@@ -189,7 +191,7 @@ def lengthened(source: Rates, change: jax.Array) -> Rates:
     Exact for photons of one energy that do not scatter: their logarithm is linear in the lengths.
     """
     further = jnp.sum(source.slopes * jnp.expm1(change)[:, None], axis=1) / jnp.maximum(source.counts, 1e-30)
-    factor = jnp.exp(jnp.clip(further, -20.0, 20.0))
+    factor = jnp.exp(jnp.clip(further, -MOST_BY_LENGTHS, MOST_BY_LENGTHS))
     slopes = source.slopes * (jnp.exp(change)[:, None] * factor[:, None])
     return replace(source, counts=source.counts * factor, slopes=slopes)
 

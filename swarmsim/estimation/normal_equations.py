@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from swarmsim.device import on_processor
-from swarmsim.estimation.forward import Problem, Rates, Rest, dead_time, variance_of
+from swarmsim.estimation.forward import MOST_BY_LENGTHS, Problem, Rates, Rest, dead_time, variance_of
 from swarmsim.estimation.likelihood import poisson_log_likelihood, scaled_inverse
 from swarmsim.pytree import pytree
 
 MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count finite
-LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step
-LOWEST_SHARE = 0.1  # of the activity that is left after one step
+LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step; of the activity's, what does not make up for lengths
+LOWEST_SHARE = 0.1  # of the activity that is left after one step, but for what makes up for lengths
 LOOSE = 1e-4  # precision of what has no prior
 
 
@@ -309,11 +309,20 @@ def _unknowns(problem: Problem, model: Linearised, sources: int) -> tuple[np.nda
 
 
 def stepped(problem: Problem, u: Unknowns, at: NormalEquations) -> Unknowns:
-    """The unknowns after a Gauss-Newton step."""
-    step = jnp.clip(scaled_inverse(at.information) @ at.push, -LONGEST_STEP, LONGEST_STEP)
+    """The unknowns after a Gauss-Newton step.
+
+    What a source adds is proportional to its activity and falls exponentially with the lengths. Behind walls that are
+    not as presumed both are far off together: the activity makes up for what the change of the lengths does to the
+    counts, and is changed by the rest of its own step besides.
+    """
+    step = scaled_inverse(at.information) @ at.push
     k, d = u.others.shape[0], u.level.shape[0]
-    sources, levels, lengths = jnp.split(step, [1 + k, 1 + k + d])
-    background = levels @ problem.detector.T
+    (source, *_), others, levels, lengths = jnp.split(step, [1, 1 + k, 1 + k + d])
+    # the logarithm of what the source adds changes with those of the lengths by so much, on the whole
+    slope = at.information[0, 1 + k + d :] / at.information[0, 0]
+    unclipped = source + slope @ lengths, others, levels, lengths
+    added, others, levels, lengths = (jnp.clip(x, -LONGEST_STEP, LONGEST_STEP) for x in unclipped)
+    sources, background = jnp.append(added - slope @ lengths, others), levels @ problem.detector.T
     taken = (
         jnp.einsum("abn,b->an", at.crossing[:, : 1 + k], sources)
         + at.crossing[:, 1 + k] * background
@@ -321,9 +330,11 @@ def stepped(problem: Problem, u: Unknowns, at: NormalEquations) -> Unknowns:
     )
     rest = at.own_push - taken
     own = jnp.clip(at.own[:, 0] * rest[0] + at.own[:, 1] * rest[1], -LONGEST_STEP, LONGEST_STEP)
+    # for what they change, as `lengthened` has it
+    made_up = jnp.exp(-jnp.clip(slope @ jnp.expm1(lengths), -MOST_BY_LENGTHS, MOST_BY_LENGTHS))
     return Unknowns(
-        activity_bq=u.activity_bq * jnp.maximum(1.0 + sources[0], LOWEST_SHARE),
-        others=jnp.clip(u.others * jnp.maximum(1.0 + sources[1:], LOWEST_SHARE), 1e-3, 1e3),
+        activity_bq=u.activity_bq * jnp.maximum(1.0 + added, LOWEST_SHARE) * made_up,
+        others=jnp.clip(u.others * jnp.maximum(1.0 + others, LOWEST_SHARE), 1e-3, 1e3),
         level=u.level + levels,
         lengths=u.lengths + lengths,
         background=u.background + own[0],

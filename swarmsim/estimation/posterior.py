@@ -154,7 +154,7 @@ def _posterior(
     known = known.at[2].set(height_precision(problem.height_std_m))
 
     def weigh(place: jax.Array, off_m: jax.Array) -> Weighed:
-        fit = settle(problem, ways_from(problem, place, off_m), nuclide, others, u, WEIGH_STEPS, exact=False)
+        fit = settle(problem, ways_from(problem, place, off_m), nuclide, others, u, WEIGH_STEPS)
         # it is the likelihood that counts less often; the priors, which the value holds as well, count in full
         priors = -0.5 * height_precision(problem.height_std_m) * jnp.square(place[2] - problem.height_m)
         priors += log_prior_of_activity(problem, fit.unknowns.activity_bq)

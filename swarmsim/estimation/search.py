@@ -25,7 +25,7 @@ from swarmsim.site.model import bounds_m
 GOLDEN_ANGLE_RAD = 2.399963  # pi (3 - sqrt 5): points turned by it from one to the next never line up
 GOLDEN_RATIO = 0.618034  # multiples of it modulo 1 fill an interval evenly
 FITTED = 4  # of the candidates of a round: the best of each part
-STEPS = 4  # Gauss-Newton steps at a place
+STEPS, PASSES = 2, 3  # Gauss-Newton steps at a place (`settle`)
 HEIGHT_REACH = 4.0  # heights are sought within so many of their standard deviations
 FARTHEST = 6.0  # standard deviations of a place within which others are looked for along its uncertainty
 TOGETHER = 24  # places that an accelerator looks at side by side
@@ -69,7 +69,7 @@ def attempt(
     """
     # lengths that a wrong place asked for would make others look wrong
     u = replace(u, lengths=jnp.where(fitted, 0.0, u.lengths))
-    fit = settle(problem, ways_from(problem, place), nuclide, others, u, STEPS, fresh=True, fitted=fitted)
+    fit = settle(problem, ways_from(problem, place), nuclide, others, u, STEPS, PASSES, fresh=True, fitted=fitted)
     return Tried(place=place, nuclide=nuclide, fit=fit)
 
 

@@ -21,7 +21,7 @@ def _values(problem, state, places):
     others = without(state, 0).added
 
     def one(at):
-        fit = settle(problem, ways_from(problem, at), CO_60, others, u, WEIGH_STEPS, exact=False)
+        fit = settle(problem, ways_from(problem, at), CO_60, others, u, WEIGH_STEPS)
         return fit.value, fit.covariance[0, 0], jnp.log(fit.unknowns.activity_bq)
 
     return jax.lax.map(one, places)

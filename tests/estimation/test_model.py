@@ -85,7 +85,7 @@ def _settled(known, m, at, nuclide):
     nothing = no_sources(problem, 1, len(NUCLIDES))
     others, unknowns = nothing.added, nothing.unknowns
     alone = without_more(problem, others, unknowns, 4)[1]
-    return settle(problem, ways_from(problem, at), nuclide, others, unknowns, 8, fresh=True), alone
+    return settle(problem, ways_from(problem, at), nuclide, others, unknowns, 4, 3, fresh=True), alone
 
 
 @pytest.mark.parametrize("boxes", [[], WALL], ids=["open", "wall"])

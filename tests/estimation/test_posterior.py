@@ -73,7 +73,7 @@ def _grid(problem, state, places):
     u = replace(state.unknowns, activity_bq=state.sources.activity_bq[0])
 
     def one(at):
-        fit = settle(problem, ways_from(problem, at), CO_60, nothing, u, WEIGH_STEPS, exact=False)
+        fit = settle(problem, ways_from(problem, at), CO_60, nothing, u, WEIGH_STEPS)
         return jnp.append(at, jnp.log(fit.unknowns.activity_bq)), fit.value, fit.covariance[0, 0]
 
     return jax.lax.map(one, places)
