@@ -74,8 +74,9 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> S
         state, moved = known
 
         def sample() -> tuple[tuple[State, jax.Array], Any]:
-            posterior, beside = _posterior(problem, state, k, rounds, per_round)
-            after, far = _moved(problem, state, k, posterior.likeliest)
+            own = _as_fitted(problem, state, k)
+            posterior, beside = _posterior(problem, own, k, rounds, per_round)
+            after, far = _moved(problem, own, k, posterior.likeliest)
             return (after, moved | far), (posterior, beside)
 
         return for_those(state.sources.present[k], sample, lambda: (known, (nowhere, zero)), IN_STEP)
@@ -88,6 +89,18 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> S
     every = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), nowhere)
     start = Sampled(posterior=every, beside=jnp.zeros(count), state=state, moved=jnp.array(True))
     return repeat_while(lambda at: at[0].moved & (at[1] < SWEEPS), sweep, (start, jnp.int32(0)), IN_STEP)[0]
+
+
+def _as_fitted(problem: Problem, state: State, k: jax.Array) -> State:
+    """The state with the unknowns of a fit of source ``k`` where it is.
+
+    Those of the fit of another one, which came last, know nothing of the walls about this one: what is far from its
+    place would be summed up about thicknesses with which its activity explains no count.
+    """
+    s = state.sources
+    tried = attempt(problem, s.nuclide[k], without(state, k).added, state.unknowns, s.place[k])
+    sound = tried.fit.likelihood > state.likelihood - BETTER
+    return jax.tree.map(partial(jnp.where, sound), with_source(problem, state, k, tried), state)
 
 
 def _moved(problem: Problem, state: State, k: jax.Array, place: jax.Array) -> tuple[State, jax.Array]:

@@ -9,12 +9,13 @@ import pytest
 
 from swarmsim.config.mission import Knowledge
 from swarmsim.estimation.fit import settle
-from swarmsim.estimation.forward import ways_from
+from swarmsim.estimation.forward import rates, ways_from
 from swarmsim.estimation.localise import problem_of
-from swarmsim.estimation.posterior import BETTER, WEIGH_STEPS, posteriors
+from swarmsim.estimation.posterior import BETTER, WEIGH_STEPS, _as_fitted, posteriors
 from swarmsim.estimation.search import attempt, mirrored_place
-from swarmsim.estimation.state import Sources, no_sources
-from tests.estimation.survey import detector, drawn_of_one, place, presumed, survey, windows
+from swarmsim.estimation.seek import with_source
+from swarmsim.estimation.state import Sources, no_sources, without
+from tests.estimation.survey import detector, drawn, drawn_of_one, mean_rois, place, presumed, survey, windows
 
 AT, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
 WALLS = [((9.5, 4.0, 1.5), (0.05, 4.0, 1.5), "concrete"), ((12.0, 6.2, 1.5), (2.5, 0.05, 1.5), "concrete")]
@@ -236,3 +237,43 @@ def test_a_straight_way_does_not_tell_its_sides_apart():
     across = float(normal @ np.asarray(found.covariance)[:2, :2] @ normal)
     assert np.sqrt(across) == pytest.approx(side, rel=0.15)
     assert float(found.effective) > 16.0
+
+
+def test_a_source_is_sampled_with_the_walls_as_its_own_fit_has_them():
+    """The fit of another one in the open, which came last, knows nothing of the walls about it."""
+    behind, flight = jnp.array([-8.0, -6.0, 1.0]), survey(altitude=12.0, count=231)
+
+    def block(half):
+        return place([((-8.0, -6.0, 1.0), (half, half, half), "concrete")])
+
+    both = [(np.array(behind), 2e9, "Co-60"), (np.array(AT), ACTIVITY, "Co-60")]
+    m = drawn(flight, mean_rois(block(0.25), (detector(),), flight, both), 1)
+    known = presumed(block(0.5), (detector(),), knowledge=Knowledge(site="geometry"))
+
+    @jax.jit
+    def one_after_another(known, m):
+        problem = problem_of(known, m, SPANS)
+        state = no_sources(problem, 2, 1)
+
+        def fitted(state, k):
+            at = jnp.stack([behind, AT])[k]
+            tried = attempt(problem, CO_60, without(state, k).added, state.unknowns, at)
+            return with_source(problem, state, k, tried), None
+
+        # one of them, the other, and both again
+        last = jax.lax.scan(fitted, state, jnp.array([0, 1, 0, 1]))[0]
+        own = _as_fitted(problem, last, jnp.int32(0))
+        ways = ways_from(problem, behind)
+
+        def more(state):
+            """How many times as much its activity adds through the walls as it is taken to add."""
+            through = rates(problem, ways, CO_60, state.unknowns.lengths, slopes=False).counts
+            return jnp.sum(state.sources.activity_bq[0] * through) / jnp.sum(state.added.counts[0])
+
+        return last, own, jnp.stack([more(last), more(own)])
+
+    last, own, more = one_after_another(known, m)
+    assert more[0] < 0.5
+    assert float(more[1]) == pytest.approx(1.0, abs=0.03)
+    assert float(own.likelihood) > float(last.likelihood) - BETTER
+    np.testing.assert_array_equal(own.sources.place, last.sources.place)
