@@ -21,7 +21,6 @@ from swarmsim.site import Site
 from swarmsim.site.rays import Crossed, crossed_from, stretched
 
 EDGE_SHARE = 0.11  # of the variance between a window's rays: an edge lies anywhere between two of them
-
 MOST_BY_LENGTHS = 20.0  # that the logarithm of a rate changes by with the lengths, in one step
 
 

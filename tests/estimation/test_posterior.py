@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from swarmsim.config.mission import Knowledge
+from swarmsim.estimation import posterior as posterior_module
 from swarmsim.estimation.fit import settle
 from swarmsim.estimation.forward import rates, ways_from
+from swarmsim.estimation.importance_sampling import Posterior
 from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.posterior import BETTER, WEIGH_STEPS, _as_fitted, posteriors
 from swarmsim.estimation.search import attempt, mirrored_place
@@ -239,8 +241,18 @@ def test_a_straight_way_does_not_tell_its_sides_apart():
     assert float(found.effective) > 16.0
 
 
-def test_a_source_is_sampled_with_the_walls_as_its_own_fit_has_them():
+def test_a_source_is_sampled_with_the_walls_as_its_own_fit_has_them(monkeypatch):
     """The fit of another one in the open, which came last, knows nothing of the walls about it."""
+
+    def lengths_of(_, state, k, *__):
+        told = Posterior(
+            mean=jnp.zeros(4).at[0].set(state.unknowns.lengths[0]), covariance=jnp.eye(4), effective=jnp.ones(()),
+            halves=jnp.zeros(()), likeliest=state.sources.place[k],
+        )  # fmt: skip
+        return told, jnp.zeros(())
+
+    monkeypatch.setattr(posterior_module, "_posterior", lengths_of)
+    monkeypatch.setattr(posterior_module, "_moved", lambda _, state, *__: (state, jnp.array(False)))
     behind, flight = jnp.array([-8.0, -6.0, 1.0]), survey(altitude=12.0, count=231)
 
     def block(half):
@@ -270,9 +282,12 @@ def test_a_source_is_sampled_with_the_walls_as_its_own_fit_has_them():
             through = rates(problem, ways, CO_60, state.unknowns.lengths, slopes=False).counts
             return jnp.sum(state.sources.activity_bq[0] * through) / jnp.sum(state.added.counts[0])
 
-        return last, own, jnp.stack([more(last), more(own)])
+        asked = posteriors(problem, last, 1, 1).posterior.mean[:, 0]
+        return last, own, jnp.stack([more(last), more(own)]), asked
 
-    last, own, more = one_after_another(known, m)
+    last, own, more, asked = one_after_another(known, m)
+    assert float(asked[0]) == pytest.approx(float(own.unknowns.lengths[0]), abs=1e-3)
+    assert abs(float(asked[1] - asked[0])) > 0.3
     assert more[0] < 0.5
     assert float(more[1]) == pytest.approx(1.0, abs=0.03)
     assert float(own.likelihood) > float(last.likelihood) - BETTER
