@@ -47,7 +47,9 @@ def _looked_at(problem: Problem, state: State, k: jax.Array, lengths: jax.Array)
     covariance = scaled_inverse(problem.learning_rate * state.sources.towards[k] + known)
     least = jnp.square(problem.geometry_std_m) + LEAST_STD_M**2
     axes = ALONG * jnp.linalg.cholesky(covariance + least * jnp.eye(3)).T
-    wide = AROUND_M * jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    # four along the axes would not see what bends along the diagonals alone, as the distance of a window does there
+    turn = jnp.arange(6) * (jnp.pi / 3.0)
+    wide = AROUND_M * jnp.stack([jnp.cos(turn), jnp.sin(turn), jnp.zeros(6)], axis=1)
     offsets = jnp.concatenate([axes, -axes, wide, jnp.zeros((1, 3))])
 
     def look(offset: jax.Array) -> tuple[Rates, tuple[jax.Array, jax.Array]]:

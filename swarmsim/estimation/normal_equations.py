@@ -27,6 +27,7 @@ MEAN_FLOOR = 1e-3  # counts of a region in a window; keeps an impossible count f
 LONGEST_STEP = 1.0  # of a logarithm in one Gauss-Newton step; of the activity's, what does not make up for lengths
 LOWEST_SHARE = 0.1  # of the activity that is left after one step, but for what makes up for lengths
 LOOSE = 1e-4  # precision of what has no prior
+LEAST_STD = 1e-3  # of a logarithm of lengths
 
 
 @pytree
@@ -141,8 +142,13 @@ def _own_precision(problem: Problem, variance: jax.Array, u: Unknowns) -> jax.Ar
 def prior_precision(problem: Problem, sources: int) -> jax.Array:
     """Precisions [P] of the unknowns that windows share."""
     loose = jnp.full(1 + sources + len(problem.detectors), LOOSE)
-    lengths = 1.0 / jnp.square(jnp.maximum(problem.material_std, 1e-3))
+    lengths = 1.0 / jnp.square(jnp.maximum(problem.material_std, LEAST_STD))
     return jnp.concatenate([loose, lengths])
+
+
+def log_prior_of_lengths(problem: Problem, lengths: jax.Array) -> jax.Array:
+    """Log prior [] of ``lengths`` [U], up to a constant; a part of `log_prior`."""
+    return -0.5 * jnp.sum(jnp.square(lengths / jnp.maximum(problem.material_std, LEAST_STD)))
 
 
 def _common(u: Unknowns) -> jax.Array:

@@ -25,7 +25,12 @@ from swarmsim.estimation.importance_sampling import Posterior, sample_posterior
 from swarmsim.estimation.likelihood import height_precision, position_of, scaled_inverse
 from swarmsim.estimation.mixture import Weighed
 from swarmsim.estimation.modes import modes_around
-from swarmsim.estimation.normal_equations import MEAN_FLOOR, joint_equations, normal_equations
+from swarmsim.estimation.normal_equations import (
+    MEAN_FLOOR,
+    joint_equations,
+    log_prior_of_lengths,
+    normal_equations,
+)
 from swarmsim.estimation.search import attempt, bounds, heard_most_at
 from swarmsim.estimation.seek import with_source
 from swarmsim.estimation.state import ALONE_STEPS, State, without
@@ -92,14 +97,21 @@ def posteriors(problem: Problem, state: State, rounds: int, per_round: int) -> S
 
 
 def _as_fitted(problem: Problem, state: State, k: jax.Array) -> State:
-    """The state with the unknowns of a fit of source ``k`` where it is.
+    """The state with the unknowns of a fit of source ``k`` where it is, unless that fit explains the counts much worse.
 
-    Those of the fit of another one, which came last, know nothing of the walls about this one: what is far from its
-    place would be summed up about thicknesses with which its activity explains no count.
+    Those of the fit that came last, if it was of another one, know nothing of the walls about this one: what is far
+    from its place would be summed up about thicknesses with which its activity explains no count. With the lengths the
+    activities, the windows' unknowns and the likelihood are those of that fit too.
     """
+    if not problem.uncertain:
+        return state
     s = state.sources
     tried = attempt(problem, s.nuclide[k], without(state, k).added, state.unknowns, s.place[k])
-    sound = tried.fit.likelihood > state.likelihood - BETTER
+    # the lengths and the height of each fit are its own source's: what is likely of them is not compared
+    above = height_precision(problem.height_std_m) * jnp.square(s.place[k, 2] - problem.height_m)
+    after = tried.fit.likelihood + 0.5 * above - log_prior_of_lengths(problem, tried.fit.unknowns.lengths)
+    before = state.likelihood - log_prior_of_lengths(problem, state.unknowns.lengths)
+    sound = jnp.isfinite(tried.fit.value) & (after > before - BETTER)
     return jax.tree.map(partial(jnp.where, sound), with_source(problem, state, k, tried), state)
 
 
@@ -111,7 +123,7 @@ def _moved(problem: Problem, state: State, k: jax.Array, place: jax.Array) -> tu
     """
     s = state.sources
     tried = attempt(problem, s.nuclide[k], without(state, k).added, state.unknowns, place)
-    better = tried.fit.likelihood > state.likelihood + BETTER
+    better = jnp.isfinite(tried.fit.value) & (tried.fit.likelihood > state.likelihood + BETTER)
     apart = jnp.linalg.norm(s.place - s.place[k], axis=-1)
     beside = jnp.any(s.present & (apart < TOGETHER_M) & (jnp.arange(len(apart)) != k))
     far = jnp.linalg.norm(place - s.place[k]) > FAR_M
@@ -171,12 +183,12 @@ def _posterior(
         # it is the likelihood that counts less often; the priors, which the value holds as well, count in full
         priors = -0.5 * height_precision(problem.height_std_m) * jnp.square(place[2] - problem.height_m)
         priors += log_prior_of_activity(problem, fit.unknowns.activity_bq)
-        inside = jnp.all((place >= limits[0]) & (place <= limits[1]))
+        sound = jnp.all((place >= limits[0]) & (place <= limits[1])) & jnp.isfinite(fit.value) & jnp.isfinite(priors)
         return Weighed(
             place=place,
             log_activity=jnp.log(jnp.maximum(fit.unknowns.activity_bq, 1e-3)),
             variance=fit.covariance[0, 0] / rate,
-            log_posterior=jnp.where(inside, rate * fit.value + (1.0 - rate) * priors, -jnp.inf),
+            log_posterior=jnp.where(sound, rate * fit.value + (1.0 - rate) * priors, -jnp.inf),
             information=rate * fit.towards + jnp.diag(known),
         )
 

@@ -116,12 +116,17 @@ def shared(u: Unknowns) -> Unknowns:
 
 
 def ratios(problem: Problem, state: State) -> jax.Array:
-    """Twice the logarithm of the likelihood ratio [K] against the same without each source, the other places held."""
+    """Twice the logarithm of the likelihood ratio [K] against the same without each source, the places held.
+
+    The state's own likelihood holds the priors of the height and of the walls of the source that was fitted last: of
+    the ratio of another one they would take away what is none of its.
+    """
+    whole = without_more(problem, state.added, state.unknowns, ALONE_STEPS)[1]
 
     def one(k: jax.Array) -> jax.Array:
         def look() -> jax.Array:
             rest = without(state, k).added
-            return 2.0 * (state.likelihood - without_more(problem, rest, state.unknowns, ALONE_STEPS)[1])
+            return 2.0 * (whole - without_more(problem, rest, state.unknowns, ALONE_STEPS)[1])
 
         return for_those(state.sources.present[k], look, lambda: jnp.zeros(()))
 
