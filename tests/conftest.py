@@ -25,14 +25,7 @@ os.environ.setdefault("GLIBC_TUNABLES", "glibc.malloc.tcache_count=65535")
 # What a loop does not change, and what it carries for nothing, is not looked for either: in loops of many thousand
 # operations each of the two took a tenth. Without the second, nor may the number of passes be looked for: XLA 0.10 ends
 # the process where it meets a limit that a loop carries along.
-# Sums in steps of a tree would be more accurate, but each step is a program of its own, for which XLA 0.10 goes through
-# all others.
-_SKIPPED = (
-    "while-loop-invariant-code-motion",
-    "simplify-while-loops",
-    "while-loop-trip-count-annotator",
-    "tree_reduction_rewriter",
-)
+_SKIPPED = ("while-loop-invariant-code-motion", "simplify-while-loops", "while-loop-trip-count-annotator")
 _FLAGS = ["--xla_backend_optimization_level=1", f"--xla_disable_hlo_passes={','.join(_SKIPPED)}"]
 if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11):
     _FLAGS.append("--xla_cpu_use_fusion_emitters=false")

@@ -121,13 +121,14 @@ def ratios(problem: Problem, state: State) -> jax.Array:
     The state's own likelihood holds the priors of the height and of the walls of the source that was fitted last: of
     the ratio of another one they would take away what is none of its.
     """
-    whole = without_more(problem, state.added, state.unknowns, ALONE_STEPS)[1]
+    present = state.sources.present
+    number = jnp.arange(present.shape[0])
 
     def one(k: jax.Array) -> jax.Array:
-        def look() -> jax.Array:
-            rest = without(state, k).added
-            return 2.0 * (whole - without_more(problem, rest, state.unknowns, ALONE_STEPS)[1])
+        counts = jnp.where((number == k)[:, None, None], 0.0, state.added.counts)
+        return without_more(problem, replace(state.added, counts=counts), state.unknowns, ALONE_STEPS)[1]
 
-        return for_those(state.sources.present[k], look, lambda: jnp.zeros(()))
-
-    return jax.lax.map(one, jnp.arange(state.sources.present.shape[0]))
+    asked = jnp.append(present, True)  # the last one: without none
+    every = jnp.arange(len(asked))
+    likelihood = jax.lax.map(lambda k: for_those(asked[k], lambda: one(k), lambda: jnp.zeros(())), every)
+    return jnp.where(present, 2.0 * (likelihood[-1] - likelihood[:-1]), 0.0)
