@@ -128,7 +128,7 @@ def ratios(problem: Problem, state: State) -> jax.Array:
         counts = jnp.where((number == k)[:, None, None], 0.0, state.added.counts)
         return without_more(problem, replace(state.added, counts=counts), state.unknowns, ALONE_STEPS)[1]
 
-    asked = jnp.append(present, True)  # the last one: without none
+    asked = jnp.append(present, True)  # the last is that of all of them
     every = jnp.arange(len(asked))
     likelihood = jax.lax.map(lambda k: for_those(asked[k], lambda: one(k), lambda: jnp.zeros(())), every)
     return jnp.where(present, 2.0 * (likelihood[-1] - likelihood[:-1]), 0.0)

@@ -16,7 +16,7 @@ from swarmsim.estimation.localise import problem_of
 from swarmsim.estimation.posterior import BETTER, WEIGH_STEPS, _as_fitted, posteriors
 from swarmsim.estimation.search import attempt, mirrored_place
 from swarmsim.estimation.seek import with_source
-from swarmsim.estimation.state import Sources, no_sources, without
+from swarmsim.estimation.state import Sources, no_sources, ratios, without
 from tests.estimation.survey import detector, drawn, drawn_of_one, mean_rois, place, presumed, survey, windows
 
 AT, ACTIVITY = jnp.array([12.0, 4.0, 1.0]), 170e6
@@ -300,3 +300,12 @@ def test_a_source_is_sampled_with_the_walls_as_its_own_fit_has_them(monkeypatch)
         assert float(own.likelihood) + unlikely > float(last.likelihood) - BETTER
         np.testing.assert_array_equal(own.sources.place, last.sources.place)
     assert float(own.likelihood) < float(last.likelihood) - BETTER
+
+
+def test_how_much_a_source_is_missed_does_not_depend_on_which_one_was_fitted_last():
+    """The likelihood of a state holds the priors of that one's walls and height."""
+    problem, state = told([], 3)
+    missed = jax.jit(ratios)
+    last, other = (float(missed(problem, replace(state, likelihood=state.likelihood - x))[0]) for x in (0.0, 50.0))
+    assert last == other
+    assert last > 1000.0
